@@ -11,7 +11,7 @@
 #   make docs                the documents as a site: site/index.html
 #   make wheel               the package: dist/*.whl     make test-wheel   it alone in an empty environment
 #   make fuzz                10,000 damaged files for every reader, and a table (FUZZ_INPUTS=500 FUZZ="-k glb")
-#   make chaos               kill a training 100 times, fill its disk, ..., and a table (CHAOS_KILLS=2 for 4 x 2 kills)
+#   make chaos               kill a training 100 times (CHAOS_KILLS=2 for 4 x 2 kills)
 #   make stability           float32 beside float64 for every kernel over its whole domain, and a table
 #   make long-run            memory, pace and compilations of 2,000 training steps (LONG_RUN_STEPS=500)
 #   make mutants             break the kernels on purpose; every fault has to be caught by the tests

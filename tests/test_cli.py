@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -66,8 +67,7 @@ REFUSED = [  # command, what its line says
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
     ("render point.xyz --run RUN", "holds 1 points in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),
-    ("render three.xyz --run RUN --workers 2", "a single file"),
-    ("render . --workers 0", "--workers: expected 1 or more, got 0"),
+    ("render . --run RUN", ".: a folder; expected a file of one of"),
     (f"{LIT} --elevation 91", "--elevation: expected -90 to 90, got 91"),
     (f"{LIT} --views -1", "--views: expected 0 or more, got -1"),
     (f"{LIT} --num-points 0", "--num-points: expected 1 or more, got 0"),
@@ -139,7 +139,7 @@ for line in sys.argv[1:]:
 def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(tmp_path, variable, below):
     others = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME")
     said = subprocess.check_output(
-        [sys.executable, "-c", SETTING_UP, "render x.ply --turntable none", "render x.ply", "evaluate a b"],
+        [sys.executable, "-c", SETTING_UP, "view x.ply", "render x.ply", "evaluate a b"],
         env={k: v for k, v in os.environ.items() if k not in others} | {variable: str(tmp_path)},
         text=True,
     )
@@ -189,19 +189,26 @@ def test_a_command_without_its_package_says_in_one_line_what_to_install(capsys, 
     assert capsys.readouterr().err == f"spnr: spnr {line.split()[0]} {needs}\n"
 
 
-def test_a_cloud_of_three_points_renders(capsys, tmp_path, run):
-    (tmp_path / "one.xyz").write_bytes(FILES["three.xyz"])
-    out = tmp_path / "out"
+def test_clouds_of_three_points_render_and_one_that_cannot_be_is_named_and_left_out(capsys, tmp_path, run):
+    clouds, out = [tmp_path / name for name in ("one.xyz", "bad.xyz", "two.xyz")], tmp_path / "out"
+    for cloud, name in zip(clouds, ("three.xyz", "point.xyz", "three.xyz"), strict=True):
+        cloud.write_bytes(FILES[name])
     arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
-    assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
+    assert exit_code("render", clouds[2], *arguments, "--turntable", "none") == 0
+    assert (out / "two_000.png").is_file()
+    shutil.rmtree(out)
+    assert exit_code("render", *clouds[:2], *arguments) == 2
     assert {path.name for path in out.iterdir()} == {
-        "one_000.png", "one_000_depth.png", "one_000_depth.npy", "one_000_depth_16bit.png", "one_000_opacity.png",
-        "one_turntable.gif", "one_cameras.json",
+        "one_000.png", "one_000_depth.png", "one_000_depth.npy", "one_000_opacity.png", "one_turntable.gif",
+        "one_cameras.json",
     }  # fmt: skip
     captured = capsys.readouterr()
     assert f"wrote {out / 'one_turntable.gif'}" in captured.out
     for name in ("base_color", "roughness", "metallic"):
         assert f"one.xyz: no {name} in the file" in captured.err
+    left_out, last = captured.err.splitlines()[-2:]
+    assert left_out.startswith(f"left out {clouds[1]}: ")
+    assert last == "spnr: 1 of 2 clouds cannot be drawn"
 
 
 @pytest.mark.ci
@@ -233,7 +240,7 @@ def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture_of_the_n
     arguments = ("--run", run, "--out", tmp_path, "--views", 1, "--turntable", "none", "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
     captured = capsys.readouterr()
-    assert "3 objects of the test split, unseen in training\n" in captured.out
+    assert "3 objects of the test split\n" in captured.out
     assert "trying the one before" in captured.out + captured.err
     assert (tmp_path / "one_000.png").is_file()
     metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())

@@ -8,8 +8,6 @@ import sys
 import pytest
 
 from spnr_jax import errors
-from spnr_jax.formats import meshes
-from spnr_jax.formats.assets import RejectedAsset
 
 
 def raised_in(module, code):
@@ -33,17 +31,6 @@ def raised_in(module, code):
 )
 def test_a_name_that_there_is_not_is_a_bug_in_our_code_alone(module, code, bug):
     assert errors.is_bug(raised_in(module, code)) is bug
-
-
-def test_a_bug_in_a_reader_of_meshes_is_not_called_a_broken_file(tmp_path, monkeypatch):
-    (tmp_path / "a.glb").write_bytes(b"glTF")
-    with pytest.raises(RejectedAsset):
-        meshes.load_mesh(tmp_path / "a.glb")
-    space = {"__name__": meshes.__name__}
-    exec("def load(path, transparent_parts): return absent", space)
-    monkeypatch.setattr(meshes, "load_gltf", space["load"])
-    with pytest.raises(NameError, match="absent"):
-        meshes.load_mesh(tmp_path / "a.glb")
 
 
 def test_errors_of_many_lines_become_one():

@@ -75,7 +75,7 @@ def main(demo: Demo) -> None:
     start = time.monotonic()
     runs = {name: demo.out / name for name in configs}
     trained = {name: read_trained(run) for name, run in runs.items()}
-    outcome = evaluation.compare(trained, dataset, runs=tuple(runs.values()))
+    outcome = evaluation.compare(trained, dataset)
     parts = {**install_seconds(), **seconds.values, "evaluate": time.monotonic() - start}
     parts["total"] = sum(parts.values())
     parts = {name: round(value, 1) for name, value in parts.items()}

@@ -77,14 +77,14 @@ def main(options: Options) -> None:
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
     runtime.keep_arrays()
     load, rows = runtime.load(), rows_of(options)
-    note = f"{runtime.hardware()}, load before {load}; {runtime.processor()}; {time.strftime('%Y-%m-%d')}"
+    note = f"{runtime.hardware()}, load before {load}; {time.strftime('%Y-%m-%d')}"
     results_folder.write(options.out, {"rows": rows}, [table(rows)], [note])
 
 
 def rows_of(options: Options) -> list[Row]:
     """All rows of these options; those that were missing are measured now."""
     asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads", "bf16")}
-    results_folder.claim(options.out, "times beside the twin", asked | {"processor": runtime.processor()})
+    results_folder.claim(options.out, "times beside the twin", asked | {"hardware": runtime.hardware()})
     variants: tuple[str | None, ...] = options.variants
     if importlib.util.find_spec("torch") is None:
         print("torch is not installed (pip install -c constraints.txt -e '.[bench]'): ours is timed alone")

@@ -13,7 +13,7 @@ arithmetic is dense, every ray against every point, a block of rays at a time.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,14 +33,12 @@ from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
 from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, metric_settings, summarise
-from spnr_jax.training.trainer import trained_on
-from spnr_jax.training.weights import Trained, place, read_trained
+from spnr_jax.training.weights import Trained, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB
 MESHES = "meshes"  # the class of all objects that come from mesh files
-EXPOSURE = {False: "unseen in training", True: "seen in training", None: "not known whether seen in training"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +213,7 @@ def evaluate(
 ) -> Evaluation:
     """Scores of a run's newest checkpoint on a split, named by what it is."""
     trained = read_trained(run, say, data=dataset.folder)
-    return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say, (place(run),))
+    return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say)
 
 
 def compare(
@@ -224,12 +222,8 @@ def compare(
     split: str = "test",
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
-    runs: Sequence[Path] = (),
 ) -> Evaluation:
-    """Scores of networks on a split, all with the points of the first, which the others are subtracted from.
-
-    `runs` are the networks' run folders, which say whether they trained on these objects.
-    """
+    """Scores of networks on a split, all with the points of the first, which the others are subtracted from."""
     first = next(iter(trained))
     config = trained[first].config
     names = dataset.splits[split]
@@ -252,7 +246,6 @@ def compare(
         "hardware": runtime.hardware(),
         "settings": {
             "split": split,
-            "objects": exposure(runs, dataset, names),
             "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
             "points": config.test_points,
             "radius factors": factors,
@@ -263,13 +256,6 @@ def compare(
         category: summarise([scores[name] for name in members]) for category, members in classes_of(scores).items()
     }
     return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
-
-
-def exposure(runs: Sequence[Path], dataset: data_sets.Dataset, names: Sequence[str]) -> str:
-    """Whether networks saw objects of a data set in training, as the records of their run folders have it."""
-    seen = [trained_on(run, dataset, names) for run in runs]
-    unseen = bool(seen) and not any(seen) and None not in seen
-    return EXPOSURE[True if any(seen) else False if unseen else None]
 
 
 def classes_of(names: Iterable[str]) -> dict[str, list[str]]:

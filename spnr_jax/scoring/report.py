@@ -1,8 +1,8 @@
 """An evaluation as files: metrics.json for programs, report.html for people.
 
 The report is one file that holds everything, to open from disk, to mail, to keep: key numbers and summary, which
-objects are scored and whether the networks trained on them, their pictures, quality beside the floors, settings.
-Images are PNGs inside the page (report.html is its template); nothing is loaded from elsewhere, and no script runs.
+objects are scored, their pictures, quality beside the floors, settings.  Images are PNGs inside the page (report.html
+is its template); nothing is loaded from elsewhere, and no script runs.
 """
 
 import json
@@ -182,9 +182,8 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
 
 
 def describe_split(metrics: Mapping) -> str:
-    """Which objects are scored, and whether the networks trained on them."""
-    settings = metrics["settings"]
-    return f"objects of the {settings['split']} split, {settings['objects']}"
+    """Which objects are scored."""
+    return f"objects of the {metrics['settings']['split']} split"
 
 
 def _summary(metrics: Mapping) -> str:

@@ -122,28 +122,21 @@ class Share(Reading):
 
 
 Output = Literal["image", "depth", "opacity"]
-WILDCARDS = "*?["  # of a pattern of files
-
-
-def is_catalogue(cloud: Path) -> bool:
-    """Whether a folder or a pattern is meant, and not a file, whatever its name."""
-    return cloud.is_dir() or (not cloud.exists() and any(mark in str(cloud) for mark in WILDCARDS))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Reading):
-    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity, a mesh, splats.
-    For a folder, or a pattern in quotation marks, every file is rendered, and a page shows them all."""
+    """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity."""
 
     cloud: tyro.conf.Positional[Path]
     """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
-    .stl .off (its surface is sampled).  Or a folder, with its subfolders, or a pattern such as 'scans/**/*.ply'."""
+    .stl .off (its surface is sampled)."""
+    others: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """More clouds, rendered one after the other; those that cannot be are named and left out."""
     run: Path | None = None
     """Network that renders: a run folder or a weights file (default: `surfels`, which the package includes)."""
     out: Path = Path("renders")
-    """Output folder.  For a folder or pattern, files that have results there are skipped."""
-    workers: int | None = None
-    """Processes that render the files of a folder or pattern (default: this one)."""
+    """Output folder."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
     """Select one object of a scene before cleaning."""
     transparent_parts: Literal["opaque", "skip"] = "opaque"
@@ -163,7 +156,7 @@ class Render(Reading):
     densify: bool = True
     """Add learned points to clouds of at most 32,768 points: sharper; films take up to three times as long."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
-    """Files to write for each view; depth comes coloured, as .npy and as 16-bit .png."""
+    """Files to write for each view; depth comes coloured and as .npy."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
@@ -176,28 +169,17 @@ class Render(Reading):
     """Frames of the turntable."""
     fps: int = 16
     """Frames per second of the turntable."""
-    mesh: bool = False
-    """Also write the surface as .glb, with the materials of the nearest points."""
-    splats: Literal["none", "ply", "spz"] = "none"
-    """Also write Gaussian splats."""
-    making: SplatMaking = field(default_factory=SplatMaking)
-    """Options of the Gaussian splats."""
 
     @property
     def light_options_given(self) -> tuple[str, ...]:
         """Names of the options that need a network that takes a light."""
         return (*self.lighting.is_given, *(("--turn light",) if self.turn == "light" else ()))
 
-    @property
-    def few(self) -> bool:
-        """Whether so few pictures are drawn that the first one counts most."""
-        return self.turntable == "none" and self.splats == "none" and not is_catalogue(self.cloud)
-
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         super().__post_init__()
         at_least(self, 0, "views")
-        at_least(self, 1, "frames", "fps", "workers")
+        at_least(self, 1, "frames", "fps")
         within(self, -90, 90, "elevation")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")

@@ -54,7 +54,7 @@ from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Export, Render, Share
-from spnr_jax.tools.pictures import Ready, load_network, make_note, prepare_cloud
+from spnr_jax.tools.pictures import Ready, prepare_cloud
 from spnr_jax.training import weights
 
 # --- objects ----------------------------------------------------------------------------------------------------------
@@ -72,18 +72,18 @@ def export_object(options: Export, note: Say, report: Say) -> None:
     if options.mesh is None:
         assert options.splats is not None
         check_suffix(options.splats)
-        ready = prepare_cloud(asked, note, load_network(asked))
-        made = _splats(ready, asked, note, report)
+        made = _splats(prepare_cloud(asked, note), options, note, report)
         size = write_splats(options.splats, made, make_note(asked))
         report(f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)")
         return
     if options.mesh.suffix.lower() != ".glb":
         raise UserError(f"{options.mesh}: a mesh is written as .glb, not {options.mesh.suffix or 'a folder'}")
     images.check_place(options.mesh)
-    ready = prepare_cloud(asked, note, load_network(asked))
+    ready = prepare_cloud(asked, note)
     solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
     images.write_whole(options.mesh, solid.content)
-    report(f"wrote {options.mesh} ({surfaces.describe(solid)}, {len(solid.content) / 1e6:.1f} MB)")
+    closed = "watertight" if solid.watertight else "not watertight"
+    report(f"wrote {options.mesh} ({solid.faces:,} faces, {closed}, {len(solid.content) / 1e6:.1f} MB)")
 
 
 def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Render:
@@ -95,16 +95,21 @@ def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Rende
         up=options.up,
         clean=options.clean,
         lighting=options.lighting,
-        making=options.making,
     )
+
+
+def make_note(asked: Render) -> str:
+    """The line that names cloud, network and light, without folders."""
+    light = Path(asked.lighting.light or ("sun" if asked.lighting.sun else "room")).name
+    return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.SHIPPED).name}), light: {light}"
 
 
 def share(options: Share, note: Say, report: Say) -> None:
     """Writes the page of a cloud; `note` gets the assumptions about the cloud, `report` a line after each step."""
     images.check_place(options.out)
     asked = as_rendered(options, options.cloud, options.run)
-    ready = prepare_cloud(asked, note, load_network(asked))
-    gaussians = _splats(ready, asked, note, report)
+    ready = prepare_cloud(asked, note)
+    gaussians = _splats(ready, options, note, report)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
     said = " · ".join(filter(None, [make_note(asked), options.credit]))
@@ -114,9 +119,9 @@ def share(options: Share, note: Say, report: Say) -> None:
     report(f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)")
 
 
-def _splats(ready: Ready, asked: Render, note: Say, report: Say) -> Gaussians:
+def _splats(ready: Ready, options: Export | Share, note: Say, report: Say) -> Gaussians:
     given = ready.model, ready.volume, ready.placed.cloud, ready.light
-    gaussians = surfaces.splats_of(*given, report, **asked.making.asked, resolution=surfaces.RESOLUTION)
+    gaussians = surfaces.splats_of(*given, report, **options.making.asked, resolution=surfaces.RESOLUTION)
     if (origin := ready.placed.origin).any():
         note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in origin)} in the file")
     return gaussians

@@ -1,13 +1,10 @@
-"""A file of points in, pictures out: stills around the object, a turntable, depth, opacity, a mesh, splats.
+"""A file of points in, pictures out: stills around the object, a turntable, depth, opacity.
 
     NAME_000.png ...            images, sRGB, on white or with straight alpha
     NAME_000_depth.png          near bright, far dark, the range of this picture
     NAME_000_depth.npy          float32, distance along the ray in the file's units, NaN where nothing is hit
-    NAME_000_depth_16bit.png    round(depth / scale), 0 where nothing is hit; NAME_cameras.json has the scale
     NAME_000_opacity.png
     NAME_turntable.gif          or .mp4
-    NAME_mesh.glb               in the file's frame and units
-    NAME_splats.ply             or .spz
     NAME_cameras.json           cameras in the nerfstudio convention in the file's frame, up axis, normalisation
 
 Depth and opacity have the resolution of the volume rendering, which an upsampler doubles for the image.
@@ -16,12 +13,11 @@ Depth and opacity have the resolution of the volume rendering, which an upsample
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import add
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,19 +29,17 @@ from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
 from spnr_jax.formats.clouds import PlacedCloud
-from spnr_jax.formats.gaussian_files import write_splats
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
-from spnr_jax.method.model import DISTANCE, Model
+from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
 from spnr_jax.surfels.lighting import background
 from spnr_jax.surfels.skies import sun
-from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.surfaces import surface_depth
-from spnr_jax.training.weights import SHIPPED, load
+from spnr_jax.training.weights import load
 
 SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, slightly warm
 
@@ -84,15 +78,6 @@ def _behind(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
 INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
-FARTHEST = DISTANCE + np.sqrt(3)  # of the box from a camera of `Model.camera`, in units of the box
-DEEPEST = 2**16 - 1  # of 16 bits; 0 is nothing
-
-
-class Written(NamedTuple):
-    """The line about what has been written, or what else is to be said; the files."""
-
-    line: str
-    paths: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,25 +92,19 @@ class Ready:
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
-    if options.workers:
-        raise UserError(f"{options.cloud}: a single file; --workers draw those of a folder or pattern")
     images.check_place(options.out / options.cloud.stem)
-    ready = prepare_cloud(options, note, load_network(options))  # a run that is none is said before the cloud is read
+    ready = prepare_cloud(options, note)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
-    for written in run_ahead(draw_all(ready, options, options.out / options.cloud.stem)):
-        if written.line:
-            yield written.line
+    yield from run_ahead(draw_all(ready, options, options.out / options.cloud.stem))
 
 
-def load_network(options: Render, loaded: Callable[[Path | None], Model] = load) -> Model:
-    """The network of the options, which `loaded` gives; ValueError if it cannot draw what they ask for."""
-    model = loaded(options.run)
+def prepare_cloud(options: Render, note: Callable[[str], None]) -> Ready:
+    """The cloud of the options read and encoded; `note` gets the assumptions about it.
+
+    ValueError, before the cloud is read, for a run that is none or a network that cannot draw what is asked for.
+    """
+    model = load(options.run)
     check_takes_light(model, options.light_options_given, options.run)
-    return model
-
-
-def prepare_cloud(options: Render, note: Callable[[str], None], model: Model) -> Ready:
-    """The cloud of the options read and encoded; `note` gets the assumptions about it."""
     light = light_of_options(options.lighting) if options.light_options_given else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -140,8 +119,8 @@ def prepare_cloud(options: Render, note: Callable[[str], None], model: Model) ->
     return Ready(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
 
 
-def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], Written]]:
-    """Draws what the options ask for; yields what writes it, under the name and its endings, in any thread.
+def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], str]]:
+    """Draws what the options ask for; yields what writes it, in any thread, and gives a line about it.
 
     Stills and film are drawn in one go: views that share their sizes share their programs.
     """
@@ -149,20 +128,13 @@ def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[],
     film = turntable_views(ready, options) if options.turntable != "none" else []
     views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
     for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
-        still = f"{name}_{i:03d}"
-        yield partial(_write, f"wrote {still}.png", still, still_files(rendering, camera, ready.volume, options))
+        yield partial(_write_still, f"{name}_{i:03d}", still_files(rendering, camera, ready.volume, options))
     if cameras:
         document = cameras_document(cameras, name.name, ready.placed, ready.volume)
-        yield partial(_write, "", str(name), [("_cameras.json", f"{json.dumps(document, indent=1)}\n".encode())])
+        images.write_whole(Path(f"{name}_cameras.json"), f"{json.dumps(document, indent=1)}\n".encode())
     if film:
         pictures = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
-    if options.mesh:
-        solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
-        line = f"wrote {name}_mesh.glb ({surfaces.describe(solid)})"
-        yield partial(_write, line, str(name), [("_mesh.glb", solid.content)])
-    if options.splats != "none":
-        yield _splats(ready, options, Path(f"{name}_splats.{options.splats}"))
 
 
 View = tuple[Camera, Light | None]
@@ -194,18 +166,15 @@ def _draw(ready: Ready, views: list[View], options: Render) -> Iterator[Renderin
         yield before(options.lighting.background, rendering, camera, light)
 
 
-def _write(line: str, stem: str, files: Iterable[tuple[str, bytes]]) -> Written:
-    """Writes files, each of what follows the stem in its name and its content."""
-    paths = []
+def _write_still(stem: str, files: Iterator[tuple[str, bytes]]) -> str:
     for suffix, data in files:
-        paths.append(Path(stem + suffix))
-        images.write_whole(paths[-1], data)
-    return Written(line, tuple(paths))
+        images.write_whole(Path(stem + suffix), data)
+    return f"wrote {stem}.png"
 
 
-def _write_film(path: Path, film: list[np.ndarray], options: Render) -> Written:
+def _write_film(path: Path, film: list[np.ndarray], options: Render) -> str:
     path, reason = images.write_turntable(path, film, options.fps)
-    return Written(f"wrote {path}" + (f" ({reason})" if reason else ""), (path,))
+    return f"wrote {path}" + (f" ({reason})" if reason else "")
 
 
 def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> Iterator[tuple[str, bytes]]:
@@ -216,23 +185,11 @@ def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: R
         yield ".png", images.png(straight_alpha(image, acc) if options.transparent else image)
     if "depth" in options.outputs:
         yield "_depth.png", images.png(images.depth_image(rendering.depth, acc))
-        depth = surface_depth(rendering, camera, volume)
-        yield "_depth.npy", _save(np.save, depth)
-        steps = Image.fromarray(in_16bit(depth, step_16bit(volume)))
-        yield "_depth_16bit.png", _save(lambda file, picture: picture.save(file, "png"), steps)
+        stream = io.BytesIO()
+        np.save(stream, surface_depth(rendering, camera, volume))
+        yield "_depth.npy", stream.getvalue()
     if "opacity" in options.outputs:
         yield "_opacity.png", images.png(np.repeat(acc[..., None], 3, axis=-1))
-
-
-def step_16bit(volume: Volume) -> float:
-    """Depth of one step of a 16-bit picture, the same for all views of `Model.camera`."""
-    return float(FARTHEST) / float(volume.scale) / DEEPEST
-
-
-def in_16bit(depth: np.ndarray, step: float) -> np.ndarray:
-    """The depth (h, w) in steps, uint16; 0 where it is NaN."""
-    steps = np.round(np.where(np.isnan(depth), 0, depth) / step)
-    return np.clip(steps, 0, DEEPEST).astype(np.uint16)
 
 
 def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
@@ -265,7 +222,6 @@ def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volu
             "centre": (np.asarray(volume.centre, np.float64) + placed.rotation @ placed.origin).tolist(),
             "scale": scale,
         },
-        "depth": {"kind": "distance along the ray", "scale_16bit": step_16bit(volume), "nothing_16bit": 0},
     }
 
 
@@ -275,31 +231,3 @@ def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
     pose[:3] = placed.rotation.T @ np.asarray(camera.cam_to_world, np.float64)
     pose[:3, 3] += placed.origin
     return pose
-
-
-def _splats(ready: Ready, options: Render, path: Path) -> Callable[[], Written]:
-    """Gaussian splats of the cloud as the network draws it."""
-    given = (ready.model, ready.volume, ready.placed.cloud, ready.light)
-    made = surfaces.splats_of(*given, lambda line: None, **options.making.asked, resolution=surfaces.RESOLUTION)
-    return lambda: Written(f"wrote {path} ({write_splats(path, made, make_note(options)) / 1e6:.1f} MB)", (path,))
-
-
-def make_note(asked: Render) -> str:
-    """The line that names cloud, network and light."""
-    network = Path(asked.run or SHIPPED).name
-    return f"{asked.cloud.name}, drawn by spnr_jax ({network}), light: {light_name(asked.lighting)}"
-
-
-def light_name(lighting: Lighting) -> str:
-    """The light in words, without folders."""
-    parts = [Path(lighting.light).name] if lighting.light else ([] if lighting.sun else ["room"])
-    parts += [f"sun {lighting.sun[0]:g} {lighting.sun[1]:g}"] if lighting.sun else []
-    options = {"yaw": lighting.light_yaw, "exposure": lighting.exposure}
-    return " + ".join(parts) + "".join(f", {name} {value:g}" for name, value in options.items() if value)
-
-
-def _save(write: Callable, content) -> bytes:
-    """What `write(file, content)` writes."""
-    stream = io.BytesIO()
-    write(stream, content)
-    return stream.getvalue()

@@ -19,8 +19,6 @@ vertices, with one material.  Coordinates are those of the file that the points 
 """
 
 import dataclasses
-import json
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +27,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
@@ -201,12 +200,10 @@ def _solid(
 SURFACE = 0.5  # solidity
 NEAREST = 4  # points whose materials a vertex takes the mean of
 RAMP = 52  # texels along each side of the ramp: steps of 5 in 8 bits, so what lies between them is exact
-ARRAY_BUFFER, INDEX_BUFFER, FLOAT, UNSIGNED = 34962, 34963, 5126, 5125  # numbers of the glTF specification
-LINEAR, CLAMPED = 9729, 33071
 
 
 class Solid(NamedTuple):
-    """A .glb file, its number of faces, and whether its surface is closed: each edge lies between two faces."""
+    """A .glb file, its number of faces, and whether its surface is closed."""
 
     content: bytes
     faces: int
@@ -219,16 +216,11 @@ def mesh_of_volume(model: Model, volume: Volume, placed: PlacedCloud, resolution
     return mesh_of(solidity(views, volume, placed, resolution), placed)
 
 
-def describe(solid: Solid) -> str:
-    """What a mesh is, behind the name of its file."""
-    return f"{solid.faces:,} faces, {'watertight' if solid.watertight else 'not watertight'}"
-
-
 def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     """The surface of a grid of solidity, 0 outside to 1 inside; ValueError if there is none."""
-    from skimage.measure import marching_cubes  # here, so that rendering alone stays quick
-
-    from spnr_jax.formats.surface_points import vertex_normals
+    import trimesh  # here, so that rendering alone stays quick
+    from skimage.measure import marching_cubes
+    from trimesh.visual.material import PBRMaterial
 
     if not grid.values.max() > SURFACE:
         raise UserError("no surface to write as a mesh: the network's pictures show nothing solid")
@@ -240,67 +232,19 @@ def mesh_of(grid: Grid, placed: PlacedCloud) -> Solid:
     _, nearest = cKDTree(points).query(vertices, min(NEAREST, len(points)))
     nearest = nearest.reshape(len(vertices), -1)
     cloud = placed.cloud
-    color, roughness, metallic = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
-    columns = {
-        "POSITION": vertices,
-        "NORMAL": vertex_normals(vertices, faces),
-        "COLOR_0": color,
-        "TEXCOORD_0": (np.stack([roughness, metallic], axis=-1) * (RAMP - 1) + 0.5) / RAMP,
-    }
-    arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
-    return Solid(glb(arrays, faces.astype(np.uint32).ravel(), grid.origin), len(faces), is_closed(faces))
+    color, *shine = (m[nearest].mean(axis=1) for m in (cloud.base_color, cloud.roughness, cloud.metallic))
+    material = PBRMaterial(metallicRoughnessTexture=ramp(), metallicFactor=1.0, roughnessFactor=1.0)
+    uv = (np.stack([shine[0], 1 - shine[1]], axis=-1) * (RAMP - 1) + 0.5) / RAMP  # trimesh's v grows upwards
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    visual.vertex_attributes["color"] = images.to_uint8(np.pad(color, [(0, 0), (0, 1)], constant_values=1))
+    mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(grid.origin))
+    content = scene.export(file_type="glb", include_normals=True)
+    return Solid(content, len(faces), mesh.is_watertight and mesh.is_winding_consistent)
 
 
-def is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:
-    """Whether each edge lies between two faces that agree which side is outside."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    there, back = (np.sort(edges[:, i] << 32 | edges[:, 1 - i]) for i in (0, 1))
-    return bool((there[1:] != there[:-1]).all() and (there == back).all())
-
-
-def ramp() -> Float[np.ndarray, "metallic roughness 3"]:
+def ramp() -> Image.Image:
     """The texture: roughness grows to the right in green, metallic downwards in blue, as glTF reads them."""
-    metallic, roughness = np.meshgrid(*[np.linspace(0, 1, RAMP, dtype=np.float32)] * 2, indexing="ij")
-    return np.stack([np.zeros_like(roughness), roughness, metallic], axis=-1)
-
-
-def glb(arrays: dict[str, np.ndarray], indices: np.ndarray, translation: np.ndarray) -> bytes:
-    """A binary glTF 2.0 file of one mesh of float32 columns and uint32 indices; vertex colours are linear, as in glTF.
-
-    Its only buffer holds the columns, the indices and the picture of the ramp, in this order.
-    """
-    stored = [*arrays.values(), indices]
-    pieces = [array.tobytes() for array in stored] + [images.png(ramp())]
-    views, content = [], b""
-    for number, piece in enumerate(pieces):
-        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(piece)})
-        if number < len(stored):
-            views[-1]["target"] = ARRAY_BUFFER if number < len(arrays) else INDEX_BUFFER
-        content += piece + bytes(-len(piece) % 4)
-    accessors: list[dict] = [
-        {"bufferView": number, "componentType": FLOAT, "count": len(array), "type": f"VEC{array.shape[1]}"}
-        for number, array in enumerate(arrays.values())
-    ]
-    position = arrays["POSITION"]
-    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
-    accessors += [{"bufferView": len(arrays), "componentType": UNSIGNED, "count": len(indices), "type": "SCALAR"}]
-    numbers = {name: number for number, name in enumerate(arrays)}
-    shine = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 1, "roughnessFactor": 1}
-    document = {
-        "asset": {"version": "2.0", "generator": "spnr_jax"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | ({"translation": translation.tolist()} if translation.any() else {})],
-        "meshes": [{"primitives": [{"attributes": numbers, "indices": len(arrays), "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": shine}],
-        "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
-        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMPED, "wrapT": CLAMPED}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(content)}],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    metallic, roughness = np.meshgrid(*[np.linspace(0, 1, RAMP)] * 2, indexing="ij")
+    return Image.fromarray(images.to_uint8(np.stack([0 * roughness, roughness, metallic], axis=-1)))

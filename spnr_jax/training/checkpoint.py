@@ -14,7 +14,6 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -136,8 +135,8 @@ def restore(
                 state = checkpointer.load(step, like)
                 jax.block_until_ready(state)
             except Exception as error:  # noqa: BLE001 - Orbax and tensorstore raise many kinds for a damaged file
-                _refuse_other_version(checkpointer, folder / str(step), like)
-                say(f"checkpoint {folder / str(step)} is damaged ({first_line(error)}); trying the one before")
+                words = f"is damaged or of another version ({first_line(error)}); trying the one before"
+                say(f"checkpoint {folder / str(step)} {words}")
                 continue
             if int(state.step) == step:
                 return state
@@ -147,28 +146,6 @@ def restore(
             f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
         )
     return None
-
-
-def _refuse_other_version(checkpointer: Any, path: Path, like: optimisation.TrainState) -> None:
-    """ValueError if a checkpoint that cannot be read is whole, but of other arrays: going on would overwrite it."""
-    try:
-        found, wanted = _shapes(checkpointer.metadata(int(path.name)).metadata), _shapes(like)
-    except Exception:  # noqa: BLE001 - as in `restore`: it is damaged
-        return
-    different = sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
-    if found and different:  # of damaged files it finds nothing
-        raise UserError(
-            f"checkpoint {path} is of another version of spnr_jax: {different[0]} has shape "
-            f"{found.get(different[0], 'none')}, here {wanted.get(different[0], 'none')}; go on with that version, or "
-            "choose a new run folder"
-        )
-
-
-def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """Shape of each array of a tree by its path, but for the random key, which is stored as plain numbers."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    named = {jax.tree_util.keystr(path, simple=True, separator="."): tuple(leaf.shape) for path, leaf in leaves}
-    return {name: shape for name, shape in named.items() if name != "key"}
 
 
 def load_run(

@@ -1,17 +1,9 @@
 """The training loop: reads batches, takes steps, and writes metrics, previews and checkpoints.
 
-    RUN/config.json  run.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
+    RUN/config.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
 
 A run continues from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they will
 be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
-
-run.json has an entry for every start:
-
-began, first_step, last_step    when it began, and the steps that it trained
-seconds                         by phase: restore, compilation (the first step), steps, previews, checkpoints, listeners
-jax, hardware                   version of JAX, and the machine
-data, data_checksum             the folder, and a number that tells data sets apart
-init                            the training whose weights a new run began with, if they were not random
 """
 
 import hashlib
@@ -20,9 +12,8 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,8 +35,8 @@ from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
-Phase = Literal["step", "row", "preview", "checkpoint", "saved", "end"]
-OnEvent = Callable[[Phase, int, Any], object]  # phase that begins, steps done, its batch, row or state
+Phase = Literal["step", "row", "preview", "checkpoint", "end"]
+OnEvent = Callable[[Phase, int, Any], object]  # phase that begins, steps done, its batch or row
 
 
 class NotFinite(UserError):
@@ -69,18 +60,15 @@ def train(
     """
     runtime.few_arenas()
     programs.check_divides(mesh, config.batch_objects)
+    tell = on_event or (lambda *event: None)
     with claim(run, config), ExitStack() as stack:
-        clock = Clock()
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
         batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
-        tell = on_event or (lambda *event: None)
         requests = stack.enter_context(stop_requests())
-        progress = Progress(config, dataset, run, schedule, first, init, clock, tell, light)
-        stack.callback(progress.close)
+        log = stack.enter_context(closing(MetricsLog(run, first, config.num_steps)))
         batches = stack.enter_context(closing(batches_from(first)))
-        clock.lap("restore")
         joins = optimisation.first_adversarial_step(config)
         for step, batch in enumerate(batches, start=first):
             if first < step == joins:
@@ -88,14 +76,27 @@ def train(
             tell("step", step, batch)
             state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
             done = step + 1
-            progress.step(done, metrics)
+            log.step(done, metrics)
             last, stopping = done == config.num_steps, bool(requests)
             save = last or stopping or done % schedule.checkpoint_every == 0
-            progress.show(state, save, last)
+            if save or done % schedule.log_every == 0:
+                row = log.mean()
+                if save:
+                    check_state(state)
+                tell("row", done, row)
+                log.write(row)
+            if last or done % schedule.preview_every == 0:
+                tell("preview", done, None)
+                with log.paused():
+                    scores, picture = preview(state, config, dataset, run, light)
+                    runtime.give_back()
+                log.write({"step": done, **scores}, picture)
             if last:
                 write_network(run, config, state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
-                progress.checkpoint(state)
+                tell("checkpoint", done, None)
+                with log.paused():
+                    checkpoint.save(run, state)
             if last or stopping:
                 tell("end", done, None)
             if stopping and not last:
@@ -137,78 +138,6 @@ def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Tra
     return state
 
 
-class Progress:
-    """What the loop writes of itself: rows, previews, checkpoints; `tell` is told before each."""
-
-    def __init__(
-        self,
-        config: TrainConfig,
-        dataset: data_sets.Dataset,
-        run: Path,
-        schedule: Schedule,
-        first: int,
-        init: Trained | None,
-        clock: "Clock",
-        tell: OnEvent,
-        light: Light | None,
-    ) -> None:
-        """Opens the log and the bar."""
-        self._of, self._schedule = (config, dataset, run, light), schedule
-        self._first, self._done, self._clock, self._tell = first, first, clock, tell
-        self._record = RunRecord(run, dataset, first, init)
-        self._log = MetricsLog(run, first)
-        self._bar = tqdm(total=config.num_steps, initial=first, unit="step", mininterval=1)
-        self._pending: list[tuple[int, dict]] = []
-
-    def step(self, done: int, metrics: dict) -> None:
-        """Keeps a step's metrics for the next row; the first step is waited for, because it compiles."""
-        self._done = done
-        self._pending.append((done, metrics))
-        self._bar.update()
-        if done == self._first + 1:
-            jax.block_until_ready(metrics)
-            self._clock.lap("compilation")
-
-    def show(self, state: optimisation.TrainState, save: bool, last: bool) -> None:
-        """A row and a preview, where they are due."""
-        if save or self._done % self._schedule.log_every == 0:
-            self._row(state, save)
-        if last or self._done % self._schedule.preview_every == 0:
-            self._tell("preview", self._done, None)
-            scores, picture = preview(state, *self._of)
-            self._log.write({"step": self._done, **scores}, picture)
-            runtime.give_back()
-            self._clock.lap("previews")
-
-    def _row(self, state: optimisation.TrainState, save: bool) -> None:
-        """The mean of the steps since the last row; NotFinite for one that is not, or for a state to be saved."""
-        rows = check_finite(jax.device_get(self._pending))
-        if save:
-            check_state(state)
-        seconds, timed = self._clock.lap("steps"), [at for at, _ in rows if at > self._first + 1]
-        pace = 1000 * (seconds / len(timed) if timed else self._clock.seconds["compilation"])
-        row, (_, newest) = {"step": self._done, **mean_row(rows), "ms_per_step": round(pace, 2)}, rows[-1]
-        self._tell("row", self._done, row)
-        self._log.write(row)
-        self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
-        self._pending = []
-
-    def checkpoint(self, state: optimisation.TrainState) -> None:
-        """The whole state, and how the time was spent."""
-        _, _, run, _ = self._of
-        self._tell("checkpoint", self._done, None)
-        checkpoint.save(run, state)
-        self._clock.lap("checkpoints")
-        self._record.write(self._done, self._clock)
-        self._tell("saved", self._done, state)
-        self._clock.lap("listeners")
-
-    def close(self) -> None:
-        """Closes bar and log."""
-        self._bar.close()
-        self._log.close()
-
-
 def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainState:
     """The state before the first step."""
     state = optimisation.jitted_create_state(config)
@@ -245,11 +174,6 @@ def check_state(state: optimisation.TrainState) -> None:
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not (finite := np.isfinite(leaf)).all():
             name = jax.tree_util.keystr(path, simple=True, separator="_")
             check_finite([(int(state.step), {name: np.asarray(leaf)[~finite][0]})])
-
-
-def mean_row(rows: list[tuple[int, dict]]) -> dict[str, float]:
-    """Mean of each metric over the steps that have it (the discriminator's begin somewhere between two rows)."""
-    return {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in rows[-1][1]}
 
 
 @contextmanager
@@ -293,10 +217,10 @@ def preview(
 
 
 class MetricsLog:
-    """metrics.jsonl and TensorBoard of a run; rows after `first_step` of an earlier run are dropped."""
+    """metrics.jsonl, TensorBoard and the bar of a run; rows after `first_step` of an earlier run are dropped."""
 
-    def __init__(self, run: Path, first_step: int) -> None:
-        """Opens both for appending."""
+    def __init__(self, run: Path, first_step: int, num_steps: int) -> None:
+        """Opens them for appending."""
         from tensorboardX import SummaryWriter
 
         path = run / "metrics.jsonl"
@@ -304,6 +228,39 @@ class MetricsLog:
         write_whole(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._file = path.open("a")
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
+        self._bar = tqdm(total=num_steps, initial=first_step, unit="step", mininterval=1)
+        self._compiled, self._since = first_step + 1, time.monotonic()
+        self._pending: list[tuple[int, dict]] = []
+
+    def step(self, done: int, metrics: dict) -> None:
+        """Keeps a step's metrics for the next row; the first step is waited for and not timed, because it compiles."""
+        self._pending.append((done, metrics))
+        self._bar.update()
+        if done == self._compiled:
+            jax.block_until_ready(metrics)
+            self._since = time.monotonic()
+
+    def mean(self) -> dict[str, int | float]:
+        """The row of the steps since the last one: the mean of those that have a metric; NotFinite for one that is not.
+
+        The discriminator's metrics begin somewhere between two rows.
+        """
+        rows, self._pending = check_finite(jax.device_get(self._pending)), []
+        done, newest = rows[-1]
+        row = {"step": done} | {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in newest}
+        now, timed = time.monotonic(), sum(at > self._compiled for at, _ in rows)
+        if timed:
+            row["ms_per_step"] = round(1000 * (now - self._since) / timed, 2)
+        self._since = now
+        self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
+        return row
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """What is done meanwhile is no step's time."""
+        begin = time.monotonic()
+        yield
+        self._since += time.monotonic() - begin
 
     def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
         """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
@@ -317,7 +274,8 @@ class MetricsLog:
             self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
 
     def close(self) -> None:
-        """Closes both."""
+        """Closes them."""
+        self._bar.close()
         self._file.close()
         self._board.close()
 
@@ -335,68 +293,6 @@ def read_rows(run: Path) -> list[dict]:
             break
         rows.append(row)
     return rows
-
-
-class Clock:
-    """Seconds since it was made, by phase: each lap belongs to one."""
-
-    def __init__(self) -> None:
-        """Starts it."""
-        self.seconds: dict[str, float] = {}
-        self._since = time.monotonic()
-
-    def lap(self, phase: str) -> float:
-        """Seconds since the lap before, counted towards the phase."""
-        now = time.monotonic()
-        elapsed, self._since = now - self._since, now
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + elapsed
-        return elapsed
-
-
-class RunRecord:
-    """The entry of this start, written anew whenever the run saves."""
-
-    def __init__(self, run: Path, dataset: data_sets.Dataset, first_step: int, init: Trained | None = None) -> None:
-        """Keeps the entries of earlier starts."""
-        self._path, self._earlier = run / "run.json", read_starts(run)
-        self._entry: dict[str, Any] = {
-            "began": datetime.now(UTC).isoformat(timespec="seconds"),
-            "first_step": first_step,
-            "jax": jax.__version__,
-            "hardware": runtime.hardware(),
-            "data": str(dataset.folder),
-            "data_checksum": checksum(dataset),
-        }
-        if init is not None:
-            self._entry["init"] = f"{init.config.preset}, {init.steps} steps"
-
-    def write(self, last_step: int, clock: Clock) -> None:
-        """Writes what is known by now."""
-        seconds = {phase: round(spent, 2) for phase, spent in clock.seconds.items()}
-        starts = [*self._earlier, self._entry | {"last_step": last_step, "seconds": seconds}]
-        write_whole(self._path, (json.dumps({"starts": starts}, indent=1) + "\n").encode())
-
-
-def read_starts(run: Path) -> list[dict]:
-    """Entries of a run's run.json; none if there is no such file or it cannot be read."""
-    try:
-        starts = json.loads((run / "run.json").read_text(errors="replace"))["starts"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return []
-    return [entry for entry in starts if isinstance(entry, dict)] if isinstance(starts, list) else []
-
-
-def trained_on(run: Path, dataset: data_sets.Dataset, names: Sequence[str]) -> bool | None:
-    """Whether a run trained on some of the objects of a data set, by its record; None where that does not say.
-
-    It does not if the run trained on another data set, which may hold the same objects, or began with weights of
-    another training.
-    """
-    starts, wanted = read_starts(run), checksum(dataset)
-    here = [entry.get("data_checksum") == wanted for entry in starts]
-    if any(here) and not set(names).isdisjoint(dataset.splits["train"]):
-        return True
-    return False if here and all(here) and not any("init" in entry for entry in starts) else None
 
 
 def checksum(dataset: data_sets.Dataset) -> str:

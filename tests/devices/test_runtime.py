@@ -103,17 +103,8 @@ def test_the_c_library_is_asked_for_as_many_arenas_as_cores_and_to_give_freed_me
     runtime.few_arenas()
     runtime.give_back()
     assert asked == [("mallopt", runtime.ARENA_MAX, 3), ("malloc_trim", 0)]
-
-
-def test_another_c_library_is_left_alone(monkeypatch):
-    def missing(name):
-        raise OSError(name)
-
-    for library in (missing, lambda name: object()):
-        monkeypatch.setattr(ctypes, "CDLL", library)
-        runtime.few_arenas()
-        runtime.keep()
-        runtime.give_back()
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
+    runtime.few_arenas()  # another C library is left alone
 
 
 PROGRAM = """

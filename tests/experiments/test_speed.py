@@ -5,7 +5,6 @@ import pytest
 from support import twin
 
 from experiments.speed import bench
-from spnr_jax.devices import runtime
 
 
 def test_the_ratio_is_the_median_of_paired_ratios():
@@ -32,11 +31,3 @@ def test_our_pytorch_twin_is_the_network_of_the_fixture():
         image, _ = generator.render_volume(volume, arrays["in/c2w"], arrays["in/focal"])
     for found, theirs in ((volume, arrays["eval/volume"]), (image, arrays["eval/image"])):
         assert (found - theirs).norm() <= 1e-5 * theirs.norm()
-
-
-def test_a_processor_is_named_with_the_sets_that_it_has(tmp_path, monkeypatch):
-    told = tmp_path / "cpuinfo"
-    monkeypatch.setattr(runtime, "CPUINFO", told)
-    assert runtime.processor().endswith("(instruction sets unknown)")
-    told.write_text("processor\t: 0\nmodel name\t: Some CPU: 9\nflags\t\t: sse avx2 avx512f xavx512_bf16\n")
-    assert runtime.processor() == "Some CPU: 9 (avx2, avx512f)"

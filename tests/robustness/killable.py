@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import multiprocessing
 import os
-import signal
 import sys
 import threading
 import time
@@ -47,12 +46,11 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Ended:
-    """A process that is over: its events, exit code (minus the signal that ended it), output, seconds from a signal."""
+    """A process that is over: its events, exit code (minus the signal that ended it), output."""
 
     events: list[Event]
     code: int
     output: str
-    seconds_to_end: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +65,10 @@ class Training:
         """What follows `spnr`."""
         return ["train", str(self.data), str(run), *OPTIONS.split(), "--num-steps", str(self.num_steps)]
 
-    def run(self, run: Path, aim: Callable[[Event], float | None] = lambda event: None, number=signal.SIGKILL) -> Ended:
-        """The training in a process that gets a signal so many seconds after the event for which `aim` names them.
+    def run(self, run: Path, aim: Callable[[Event], float | None] = lambda event: None) -> Ended:
+        """The training in a process that is killed so many seconds after the event for which `aim` names them.
 
-        It begins nothing else before: the signal falls into the phase that was aimed at, or at its end.
+        It begins nothing else before: the kill falls into the phase that was aimed at, or at its end.
         """
         os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION)  # the server hands it on
         ours, theirs = SERVER.Pipe()
@@ -78,26 +76,23 @@ class Training:
         process = SERVER.Process(target=_child, args=(self.arguments(run), self.cache, output, theirs))
         process.start()
         theirs.close()  # so that the pipe ends with the process
-        sent, events = None, []
+        events: list[Event] = []
         while ours.poll(LIMIT):
             try:
                 events.append(ours.recv())
-                delay = aim(events[-1]) if sent is None else None
-                ours.send("go on")  # it waits for that: with the next event until the signal was sent
+                delay = aim(events[-1])
+                ours.send("go on")  # it waits for that: with the next event until it was killed
             except (EOFError, OSError):
                 break
             if delay is not None:
                 time.sleep(delay)
-                os.kill(process.pid, number)
-                sent = time.monotonic()
+                process.kill()
+                break
         else:
             process.kill()
             raise AssertionError(f"the training hung for {LIMIT:.0f} s after {events[-1:]}")
         process.join()
-        seconds = 0.0 if sent is None else time.monotonic() - sent
-        return Ended(
-            events=events, code=process.exitcode, output=output.read_text(errors="replace"), seconds_to_end=seconds
-        )
+        return Ended(events=events, code=process.exitcode, output=output.read_text(errors="replace"))
 
 
 def _child(arguments: list[str], cache: Path, output: Path, events: Connection) -> None:

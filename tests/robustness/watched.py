@@ -15,11 +15,6 @@ FORBIDDEN = {
     *("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "socket.connect", "pickle.find_class", "os.fork"),
     *("os.forkpty", "ctypes.dlopen", "urllib.Request", "webbrowser.open", "exec"),
 }
-CHANGES = {  # event -> which of its arguments are paths that it changes
-    **dict.fromkeys(("os.mkdir", "os.rmdir", "os.remove", "os.chmod"), (0,)),
-    **dict.fromkeys(("shutil.rmtree", "tempfile.mkstemp", "tempfile.mkdtemp"), (0,)),
-    **{"os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)},
-}
 PROGRAM = tuple(map(os.path.realpath, (sys.prefix, sys.base_prefix, Path(__file__).parents[2], "/proc", "/sys")))
 PROGRAM += ("/usr", "/lib", "/etc/ssl", "/etc/localtime", "/dev")
 
@@ -43,10 +38,6 @@ class Watch:
             # a traceback looks for the source of code that has no file
             if not path.startswith("<") and not self.within(path) and (writes or not self.of_program(path)):
                 self.broken.append(f"{'writes' if writes else 'reads'} {path[:200]}")
-        elif event in CHANGES:
-            paths = [arguments[i] for i in CHANGES[event] if isinstance(arguments[i], str | bytes | os.PathLike)]
-            places = [_absolute(arguments, os.fsdecode(path)) for path in paths]
-            self.broken += [f"{event} {place[:200]}" for place in places if not self.within(place)]
         elif event in FORBIDDEN and not (event == "exec" and _of_import(arguments)):
             self.broken.append(f"{event} {str(arguments)[:200]}")
 
@@ -58,13 +49,6 @@ class Watch:
         """Whether a path belongs to the interpreter, a package or the system, and not to what lies beside the input."""
         real = os.path.realpath(path)
         return real.startswith(PROGRAM) and not real.startswith(os.path.dirname(self.inside.rstrip(os.sep)))
-
-
-def _absolute(arguments: tuple[Any, ...], path: str) -> str:
-    """The path of an event, with the open folder that it is relative to, which is its last argument if there is one."""
-    opened = arguments[-1]
-    relative = isinstance(opened, int) and opened >= 0 and not os.path.isabs(path)
-    return os.path.join(os.readlink(f"/proc/self/fd/{opened}") if relative else "", path)
 
 
 def _of_import(arguments: tuple[Any, ...]) -> bool:

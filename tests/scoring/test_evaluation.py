@@ -1,7 +1,6 @@
 """Scores are those of the metrics called by hand on the files' pictures; nothing is left out unsaid."""
 
 import dataclasses
-import json
 import shutil
 
 import jax
@@ -18,7 +17,7 @@ from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import METRICS, flip
-from spnr_jax.training import checkpoint, optimisation, trainer, weights
+from spnr_jax.training import checkpoint, optimisation, weights
 
 NAMES = tiny_dataset.SPLITS["test"]
 ssim, cpsnr = jax.jit(metrics.ssim), jax.jit(metrics.conditional_psnr)
@@ -140,39 +139,6 @@ def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypat
     asked = {"white": evaluation.floor("white")}
     result = evaluation.evaluate_object(asked, CONFIG, data_sets.read_object(tiny_dataset.dataset(), NAMES[0]))
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
-
-
-UNKNOWN = "not known whether seen in training"
-EXPOSURE = [  # starts that the record of a run names, split, what may be said
-    ([{}, {}], "test", "unseen in training"),
-    ([{}, {}], "train", "seen in training"),
-    ([], "test", UNKNOWN),
-    ([{}, {"data_checksum": "another"}], "test", UNKNOWN),
-    ([{"init": "small, 9 steps"}], "test", UNKNOWN),
-    ([{"init": "small, 9 steps"}], "train", "seen in training"),
-]
-
-
-def recorded(folder, *starts):
-    folder.mkdir()
-    here = {"data_checksum": trainer.checksum(tiny_dataset.dataset())}
-    (folder / "run.json").write_text(json.dumps({"starts": [here | start for start in starts]}))
-    return folder
-
-
-@pytest.mark.parametrize(("starts", "split", "expected"), EXPOSURE)
-def test_a_report_says_that_objects_are_unseen_by_the_record_of_the_run_alone(starts, split, expected, tmp_path):
-    dataset, run = tiny_dataset.dataset(), recorded(tmp_path / "run", *starts)
-    assert evaluation.exposure((run,), dataset, dataset.splits[split]) == expected
-
-
-def test_of_several_runs_and_objects_the_least_favourable_counts(tmp_path):
-    dataset, run = tiny_dataset.dataset(), recorded(tmp_path / "run", {})
-    train = dataset.splits["train"]
-    assert evaluation.exposure((run,), dataset, (*NAMES, train[0])) == "seen in training"
-    assert evaluation.exposure((run, run), dataset, NAMES) == "unseen in training"
-    assert evaluation.exposure((run, tmp_path), dataset, NAMES) == evaluation.exposure((), dataset, NAMES) == UNKNOWN
-    assert evaluation.exposure((tmp_path, run), dataset, train) == "seen in training"
 
 
 def test_objects_are_spread_from_the_first_to_the_last():

@@ -13,7 +13,7 @@ from spnr_jax.tools import pictures
 from spnr_jax.tools.commands import Lighting, Render
 
 OPTIONS = {"views": 2, "resolution": 24, "num_points": 30, "up": "y", "frames": 5}
-KINDS = (".png", "_depth.png", "_depth.npy", "_depth_16bit.png", "_opacity.png")
+KINDS = (".png", "_depth.png", "_depth.npy", "_opacity.png")
 STILLS = {f"chair_{i:03d}{kind}" for i in range(2) for kind in KINDS} | {"chair_cameras.json"}
 
 
@@ -49,11 +49,6 @@ def test_stills_depth_opacity_and_a_turntable_of_the_asked_frames_are_written(tm
     assert any("30 of 40 points" in line for line in lines)
     pictures = ("chair_000.png", "chair_001.png", "chair_turntable.gif")
     assert [line for line in lines if line.startswith("wrote")] == [f"wrote {out / name}" for name in pictures]
-    scale = json.loads((out / "chair_cameras.json").read_text())["depth"]["scale_16bit"]
-    depth, steps = np.load(out / "chair_000_depth.npy"), shown(out / "chair_000_depth_16bit.png")
-    assert (depth.dtype, steps.dtype) == (np.float32, np.uint16)
-    np.testing.assert_array_equal(steps == 0, np.isnan(depth))
-    np.testing.assert_allclose(scale * steps[steps > 0], depth[steps > 0], atol=scale)
 
 
 def test_a_file_turned_and_moved_gives_the_same_pictures_and_cameras_that_moved_with_it(tmp_path):

@@ -117,21 +117,3 @@ def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_
         assert decibels(now, poster) < 28
         tab.mouse.wheel(0, 200)
         until(tab, "viewer.camera.distance > 3.3")
-
-
-def test_a_coarse_picture_shows_the_same_object_and_rest_brings_the_whole_one(chromium, tmp_path):
-    path, poster = page(tmp_path, 1)
-    with opened(chromium, path) as tab:
-        tab.evaluate("document.querySelectorAll('header, footer').forEach((part) => part.style.display = 'none')")
-        tab.evaluate("viewer.draw(0.5)")
-        assert tab.evaluate("document.getElementById('canvas').width") == SIZE // 2
-        content = tab.screenshot()
-        coarse = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(np.float32) / 255
-        assert 18 < decibels(coarse, poster) < 40
-        tab.evaluate("viewer.share = 0.3")  # as after a picture that took long
-        tab.evaluate("document.getElementById('canvas').focus()")
-        tab.keyboard.press("ArrowLeft")
-        until(tab, f"document.getElementById('canvas').width === {SIZE} && viewer.frames >= 4")
-        assert tab.evaluate("viewer.frames") == 4, "first, coarse, coarse again, whole"
-        tab.evaluate("document.getElementById('canvas').blur()")  # without the ring around what has the keys
-        assert decibels(shown(tab), splat_twin.draw(splat_balls.ball(), splat_balls.camera(38.0, 20.0, SIZE))[0]) > 28

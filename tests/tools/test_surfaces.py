@@ -19,8 +19,8 @@ from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.records import Rendering, Volume
 from spnr_jax.surfels.gaussians import View
-from spnr_jax.tools import pictures, surfaces
-from spnr_jax.tools.surfaces import Grid, is_closed, mesh_of, surface_depth
+from spnr_jax.tools import surfaces
+from spnr_jax.tools.surfaces import Grid, mesh_of, surface_depth
 
 UNIT = 10.0  # half diagonal of the cloud, in its own units
 
@@ -51,20 +51,11 @@ def test_the_background_that_shines_through_is_taken_out_again(scene):
     np.testing.assert_allclose(opaque, distance, rtol=1e-6)
 
 
-def test_what_lets_most_of_the_light_pass_has_no_depth_and_0_in_16_bits(scene):
+def test_what_lets_most_of_the_light_pass_has_no_depth(scene):
     volume, camera = scene
     acc = np.array([[0.0, 0.49], [0.51, 1.0]])
     hit = surface_depth(rendering(np.full((2, 2), 30.0), acc), camera, volume)
     np.testing.assert_array_equal(np.isnan(hit), acc < 0.5)
-    np.testing.assert_array_equal(pictures.in_16bit(hit, pictures.step_16bit(volume)) == 0, acc < 0.5)
-
-
-def test_16_bits_hold_every_distance_in_the_box_to_half_a_step(scene):
-    volume, _ = scene
-    step = pictures.step_16bit(volume)
-    depth = np.linspace(1.3, 3 + 3**0.5, 50)[None] * UNIT
-    assert step < 1e-4 * UNIT
-    np.testing.assert_allclose(pictures.in_16bit(depth, step) * step, depth, atol=0.51 * step)
 
 
 # what pictures with known depth say is solid: a ball, a plate thinner than the band
@@ -190,14 +181,6 @@ def test_each_place_wears_the_material_of_the_points_there_whichever_way_is_up(t
         np.testing.assert_allclose(metallic[side], shine[1], atol=1e-3)
     outward = ((part.positions - CENTRE) * part.normals).sum(axis=1) / RADIUS
     assert outward.min() > 0.9
-
-
-def test_a_surface_with_a_hole_or_a_face_that_is_turned_around_is_not_called_closed():
-    faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-    assert is_closed(faces)
-    assert not is_closed(faces[:3])
-    assert not is_closed(np.concatenate([faces[:3], faces[3:, ::-1]]))
-    assert not is_closed(np.concatenate([faces, faces[:1]]))
 
 
 def test_a_mesh_far_from_the_origin_keeps_its_precision():

@@ -1,7 +1,6 @@
-"""Training with settings and batches that nobody meant: finite to its end, or stopped with step and quantity."""
+"""Training with settings and batches that nobody meant stays finite."""
 
 import functools
-import re
 from contextlib import closing
 from dataclasses import replace
 
@@ -12,13 +11,11 @@ import pytest
 from support import tiny_dataset
 from support.tiny_baselines import SHRUNKEN
 
-from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.training import batching, optimisation, trainer
+from spnr_jax.config import LossConfig, OptimizerConfig
+from spnr_jax.training import batching, optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
 
-EVERY_STEP = trainer.Schedule(log_every=1, preview_every=100, checkpoint_every=100)
-NAMED = re.compile(r"(\w+) is (?:nan|inf|-inf) at step (\d+); the last checkpoint is kept")
 TAME = replace(
     tiny_dataset.CONFIG,
     loss=LossConfig(discriminator_width=4, r1_interval=2),
@@ -27,15 +24,11 @@ TAME = replace(
 )
 
 
-def wild(config: TrainConfig, rates: float, **weights: float) -> TrainConfig:
-    """The config with both learning rates so many times higher, and other weights in its loss."""
-    o = config.optimizer
-    faster = replace(o, lr_generator=rates * o.lr_generator, lr_discriminator=rates * o.lr_discriminator)
-    return replace(config, optimizer=faster, loss=replace(config.loss, **weights))
-
-
-WILD = wild(TAME, 100, l1_weight=1e6, adversarial_weight=1e6)
-HOPELESS = wild(TAME, 1e11, adversarial_weight=0.0)
+WILD = replace(  # rates a hundred times too high, both losses weighted with a million
+    TAME,
+    optimizer=replace(TAME.optimizer, lr_generator=0.2, lr_discriminator=0.02),
+    loss=replace(TAME.loss, l1_weight=1e6, adversarial_weight=1e6),
+)
 
 
 def assert_finite(tree):
@@ -43,31 +36,6 @@ def assert_finite(tree):
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
-
-
-def train_to_the_end_or_a_name(config, dataset, run) -> str | None:
-    """The quantity that stopped the training, None if it reached its end; every step before has a finite row."""
-    try:
-        state = trainer.train(config, dataset, run, EVERY_STEP)
-    except trainer.NotFinite as error:
-        quantity, step = NAMED.match(str(error)).groups()
-        whole = int(step) - 1
-    else:
-        assert_finite(state)
-        updates = state.generator_optimizer[0].count, state.discriminator_optimizer[0].count
-        assert updates == (config.num_steps, config.num_steps - optimisation.first_adversarial_step(config))
-        quantity, whole = None, config.num_steps
-    rows = [row for row in trainer.read_rows(run) if "loss" in row]
-    assert [row["step"] for row in rows] == list(range(1, whole + 1))
-    assert all(np.isfinite(value) for row in rows for value in row.values())
-    return quantity
-
-
-@pytest.mark.parametrize("config", [WILD, pytest.param(HOPELESS, marks=pytest.mark.slow)], ids=["wild", "hopeless"])
-def test_training_with_wild_settings_is_finite_to_its_end_or_stops_by_name(config, tmp_path):
-    """Learning rates a hundred times too high and both losses weighted with a million; rates beyond all hope."""
-    stopped = train_to_the_end_or_a_name(config, tiny_dataset.dataset(), tmp_path)
-    assert (stopped is None) == (config is WILD)
 
 
 def without_points(batch, kept=-1):
