@@ -12,7 +12,6 @@ import re
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -177,21 +176,17 @@ def run_view(command: View) -> None:
 
 def run_export(command: Export) -> None:
     """`spnr export`."""
-    if command.splats is None and command.mesh is None:
-        from spnr_jax.tools.export import export_network
+    from spnr_jax.tools.export import export_network, export_object
 
-        print(export_network(command))
-    else:
-        from spnr_jax.tools.export import export_object
-
-        export_object(command, _make_note(command.run), partial(print, flush=True))
+    whole = command.splats is None
+    print(export_network(command) if whole else export_object(command, _make_note(command.run)))
 
 
 def run_share(command: Share) -> None:
     """`spnr share`."""
     from spnr_jax.tools.export import share
 
-    share(command, _make_note(command.cloud), partial(print, flush=True))
+    print(share(command, _make_note(command.cloud)))
 
 
 RUN: dict[type, Callable] = {

@@ -13,7 +13,7 @@ arithmetic is dense, every ray against every point, a block of rays at a time.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
@@ -38,7 +39,6 @@ from spnr_jax.training.weights import Trained, read_trained
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 FLOORS = ("white", "splat", "nearest")
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB
-MESHES = "meshes"  # the class of all objects that come from mesh files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +83,17 @@ def _score(
     }
 
 
-@partial(jax.jit, static_argnames="method")
-def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float | Array) -> tuple[Array, Array]:
+def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float) -> tuple[Array, Array]:
     """Image and opacity of a trivial renderer for all views of one cloud."""
     if method == "white":
         image = white(camera)
         return image, jnp.zeros(image.shape[:-1])
-    radius, draw = factor * spacing(cloud), {"splat": splat, "nearest": nearest}[method]
+    return _draw_floor(cloud, camera, jnp.float32(factor * spacing(cloud)), method=method)
+
+
+@partial(jax.jit, static_argnames="method")
+def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
+    draw = {"splat": splat, "nearest": nearest}[method]
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
@@ -168,7 +172,6 @@ class Evaluation:
 
     config: TrainConfig
     summary: dict
-    per_category: dict[str, dict]
     gallery: list[ObjectResult]
 
 
@@ -212,7 +215,7 @@ def evaluate(
     say: Callable[[str], None] = print,
 ) -> Evaluation:
     """Scores of a run's newest checkpoint on a split, named by what it is."""
-    trained = read_trained(run, say, data=dataset.folder)
+    trained = read_trained(run, say)
     return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say)
 
 
@@ -252,24 +255,7 @@ def compare(
             "metrics": metric_settings(),
         },
     }
-    per_category = {
-        category: summarise([scores[name] for name in members]) for category, members in classes_of(scores).items()
-    }
-    return Evaluation(config=config, summary=summary, per_category=per_category, gallery=gallery)
-
-
-def classes_of(names: Iterable[str]) -> dict[str, list[str]]:
-    """The objects of each class, sorted."""
-    classes: dict[str, list[str]] = {}
-    for name in sorted(names):
-        classes.setdefault(category_of(name), []).append(name)
-    return dict(sorted(classes.items()))
-
-
-def category_of(name: str) -> str:
-    """Class of an object from its name (chair_000012); mesh files are one class."""
-    stem, _, number = name.rpartition("_")
-    return stem if number.isdigit() and len(number) == 6 else MESHES
+    return Evaluation(config=config, summary=summary, gallery=gallery)
 
 
 # --- the trivial renderers --------------------------------------------------------------------------------------------
@@ -319,21 +305,10 @@ def nearest(
     return _shade_first(cloud, camera, order)
 
 
-def spacing(cloud: PointCloud) -> Float[Array, ""]:
+def spacing(cloud: PointCloud) -> float:
     """Median distance of a real point to its nearest other, in world units; 0 for fewer than two points."""
-    positions = cloud.positions.T
-    number = jnp.arange(cloud.mask.shape[0])
-
-    def to_nearest(point):
-        index, position = point
-        squared = jnp.sum((positions - position[:, None]) ** 2, axis=0)
-        return jnp.min(jnp.where(cloud.mask & (number != index), squared, jnp.inf))
-
-    squared = _map_blocks(to_nearest, (number, cloud.positions), cloud.mask.shape[0])
-    ordered = jnp.sort(jnp.where(cloud.mask, jnp.sqrt(squared), jnp.inf))
-    count = jnp.sum(cloud.mask)
-    middle = 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
-    return jnp.where(count > 1, middle, 0.0)
+    real = np.asarray(cloud.positions)[np.asarray(cloud.mask)]
+    return float(np.median(cKDTree(real).query(real, 2)[0][:, 1])) if len(real) > 1 else 0.0
 
 
 def _shade_first(cloud, camera, order):

@@ -150,7 +150,7 @@ DIFFERENCES_NOTE = (
 
 def write_results(out: Path, evaluation: Evaluation, dataset_settings: dict, seconds: dict[str, float]) -> None:
     """Writes metrics.json and report.html into a folder."""
-    metrics = {**evaluation.summary, "seconds": seconds, "per_category": evaluation.per_category}
+    metrics = evaluation.summary | {"seconds": seconds}
     write_whole(out / "metrics.json", (json.dumps(metrics, indent=2, allow_nan=False) + "\n").encode())
     settings = {"training": to_dict(evaluation.config), "data": dataset_settings, **metrics["settings"]}
     write_report(out / "report.html", settings, metrics, evaluation.gallery)
@@ -161,12 +161,11 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
 
     The first of the methods is the network that "NAME_minus" subtracts from.
     """
-    methods, per_category = metrics["methods"], metrics["per_category"]
+    methods = metrics["methods"]
     first = next(iter(methods))
     minus = metrics.get(f"{first}_minus")
     tables = [_quality_table(methods)]
     tables += [_difference_table(first, minus)] if minus else []
-    tables += [_category_table(per_category)] if per_category else []
     shown = _shown(gallery[0]) if gallery else {}
     page = template(Path(__file__).with_name("report.html")).render(
         title=f"Sparse-point neural rendering: {describe_split(metrics)}",
@@ -273,19 +272,7 @@ def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     return Table(title="Differences", note=DIFFERENCES_NOTE, heads=tuple(map(head, names)), rows=rows)
 
 
-def _category_table(per_category: Mapping[str, Mapping]) -> Table:
-    """Categories against the PSNR of every method."""
-    methods = list(dict.fromkeys(method for scores in per_category.values() for method in scores))
-    rows = []
-    for category, scores in per_category.items():
-        objects = next((s["objects"] for s in scores.values() if "objects" in s), "")
-        of_all = quality({m: {"psnr": scores.get(m, {}).get("psnr")} for m in methods}, ["psnr"])
-        rows.append((category, (*(cell for (cell,) in of_all.values()), text(objects))))
-    heads = (*(label(method) for method in methods), "Objects")
-    return Table(title="Quality by category", note="PSNR in dB.", heads=heads, rows=tuple(rows))
-
-
 def _run_facts(metrics: Mapping) -> dict[str, object]:
     """What made the scores, and how long that took; the rest of metrics.json has tables of its own."""
-    tables = ("methods", f"{next(iter(metrics['methods']))}_minus", "per_category", "settings")
+    tables = ("methods", f"{next(iter(metrics['methods']))}_minus", "settings")
     return flatten({name: value for name, value in metrics.items() if name not in tables})

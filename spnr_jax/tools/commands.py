@@ -5,7 +5,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import tyro
 
@@ -59,11 +59,6 @@ class SplatMaking:
     """Degree of the spherical harmonics of a splat's colour; 0: it does not depend on the view."""
     fitting_views: int = 32
     """Pictures of the network that the splats are made from."""
-
-    @property
-    def asked(self) -> dict[str, Any]:
-        """What `surfaces.splats_of` is asked for."""
-        return {"degree": self.harmonics, "most": self.most_splats, "views": self.fitting_views}
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -222,31 +217,29 @@ class Evaluate:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a surfel network as a weights file, as functions for JAX without this package, and as StableHLO.  Or write
-    a cloud's object: with --splats as Gaussian splats, with --mesh as its surface."""
+    """Write a surfel network as a weights file, as functions for JAX without this package, and as StableHLO.  Or, with
+    --splats, write a cloud's object as Gaussian splats."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder of the network to export; with --splats or --mesh, a cloud that `spnr render` reads."""
+    """Run folder of the network to export; with --splats, a cloud that `spnr render` reads."""
     splats: Path | None = None
     """Write Gaussian splats: .ply or .spz."""
-    mesh: Path | None = None
-    """Write the surface with its materials: .glb, in the frame and units of the cloud's file."""
     network: Path | None = None
-    """Network that renders the cloud for --splats and --mesh, as `spnr render --run` (default: surfels)."""
+    """Network that renders the cloud for --splats, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into --splats."""
     making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
     """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The upward axis of the file for --splats and --mesh; splats are written with y up."""
+    """The upward axis of the file for --splats, which are written with y up."""
     clean: Literal["auto", "off", "strong"] = "auto"
-    """As for `spnr render`, for --splats and --mesh."""
+    """As for `spnr render`, for --splats."""
     out: Path = Path("exported")
     """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, export.json with their inputs and outputs,
     and light.npz, the room."""
     num_points: int | None = None
-    """Exact number of points of a cloud, padding included (default: 1,024).  With --splats and --mesh, points kept of a
-    larger cloud (default: 16,384)."""
+    """Exact number of points of a cloud, padding included (default: 1,024).  With --splats, points kept of a larger
+    cloud (default: 16,384)."""
     resolution: int | None = None
     """Pixels along each side (default: the size of the training)."""
     quality: Literal["draft", "balanced", "best", "trained"] = "best"
@@ -257,14 +250,12 @@ class Export:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         at_least(self, 1, "num_points")
-        require(None in (self.splats, self.mesh), "--splats and --mesh are written one at a time")
-        given = ["light"] if self.lighting.is_given else []
-        given += ["most-splats"] if self.making != SplatMaking() else []
-        if self.splats is None and given:
-            raise ValueError(f"--{given[0]} is for --splats FILE, which is not given")
         given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
-        if self.splats is None and self.mesh is None and given:
-            raise ValueError(f"--{given[0]} is for --splats FILE or --mesh FILE, which is not given")
+        given += ["light"] if self.lighting.is_given else []
+        given += ["most-splats"] if self.making != SplatMaking() else []
+        require(
+            self.splats is not None or not given, f"--{''.join(given[:1])} is for --splats FILE, which is not given"
+        )
         at_white = self.lighting.background == "white"
         require(at_white, "--background light: splats have no background; leave it out")
 

@@ -1,4 +1,4 @@
-"""What leaves the package: a cloud's object as splats, as a mesh or as a page for any browser, and the network itself.
+"""What leaves the package: a cloud's object as splats or as a page for any browser, and the network itself.
 
 Splats have y up, the units of the cloud's file and, unless float32 is too coarse there, its origin.
 
@@ -66,24 +66,14 @@ POSTER_QUALITY = 88  # of its JPEG
 Say = Callable[[str], None]
 
 
-def export_object(options: Export, note: Say, report: Say) -> None:
-    """Writes a cloud's mesh or splats; `note` gets the assumptions about the cloud, `report` a line after each step."""
+def export_object(options: Export, note: Say) -> str:
+    """Writes a cloud's splats; a line about it.  `note` gets the assumptions about the cloud."""
     asked = as_rendered(options, options.run, options.network)
-    if options.mesh is None:
-        assert options.splats is not None
-        check_suffix(options.splats)
-        made = _splats(prepare_cloud(asked, note), options, note, report)
-        size = write_splats(options.splats, made, make_note(asked))
-        report(f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)")
-        return
-    if options.mesh.suffix.lower() != ".glb":
-        raise UserError(f"{options.mesh}: a mesh is written as .glb, not {options.mesh.suffix or 'a folder'}")
-    images.check_place(options.mesh)
-    ready = prepare_cloud(asked, note)
-    solid = surfaces.mesh_of_volume(ready.model, ready.volume, ready.placed)
-    images.write_whole(options.mesh, solid.content)
-    closed = "watertight" if solid.watertight else "not watertight"
-    report(f"wrote {options.mesh} ({solid.faces:,} faces, {closed}, {len(solid.content) / 1e6:.1f} MB)")
+    assert options.splats is not None
+    check_suffix(options.splats)
+    made = _splats(prepare_cloud(asked, note), options, note)
+    size = write_splats(options.splats, made, make_note(asked))
+    return f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)"
 
 
 def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Render:
@@ -104,24 +94,33 @@ def make_note(asked: Render) -> str:
     return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.SHIPPED).name}), light: {light}"
 
 
-def share(options: Share, note: Say, report: Say) -> None:
-    """Writes the page of a cloud; `note` gets the assumptions about the cloud, `report` a line after each step."""
+def share(options: Share, note: Say) -> str:
+    """Writes the page of a cloud; a line about it.  `note` gets the assumptions about the cloud."""
     images.check_place(options.out)
     asked = as_rendered(options, options.cloud, options.run)
     ready = prepare_cloud(asked, note)
-    gaussians = _splats(ready, options, note, report)
+    gaussians = _splats(ready, options, note)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
     said = " · ".join(filter(None, [make_note(asked), options.credit]))
     view = (options.azimuth, options.elevation)
     content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, said)
     images.write_whole(options.out, content)
-    report(f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)")
+    return f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)"
 
 
-def _splats(ready: Ready, options: Export | Share, note: Say, report: Say) -> Gaussians:
-    given = ready.model, ready.volume, ready.placed.cloud, ready.light
-    gaussians = surfaces.splats_of(*given, report, **options.making.asked, resolution=surfaces.RESOLUTION)
+def _splats(ready: Ready, options: Export | Share, note: Say) -> Gaussians:
+    how = options.making
+    gaussians = surfaces.splats(
+        ready.model,
+        ready.placed.cloud,
+        light=ready.light,
+        degree=how.harmonics,
+        most=how.most_splats,
+        views=how.fitting_views,
+        resolution=surfaces.RESOLUTION,
+        volume=ready.volume,
+    )
     if (origin := ready.placed.origin).any():
         note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in origin)} in the file")
     return gaussians

@@ -52,7 +52,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """All that decides a frame; `light` is made of `lighting` and `maps` when it is needed, `stale` until then."""
+    """All that decides a frame; `light()` is that of `lighting` and `maps`, made when it is first drawn in."""
 
     name: str
     cloud: PointCloud
@@ -61,8 +61,7 @@ class State:
     quality: str = "best"
     lighting: Lighting = Lighting()
     maps: Mapping[str, Light] = field(default_factory=dict)
-    light: Light | None = None
-    stale: bool = False
+    light: Callable[[], Light | None] = lambda: None
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -77,9 +76,9 @@ class State:
 
 def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -> State:
     """What a browser sees first of a cloud that was just read; ValueError for what cannot be encoded or is no map."""
-    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting, stale=bool(lighting.is_given))
+    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting)
     if lighting.light is None or lighting.light in NAMES:
-        return state
+        return relight(state, lighting) if lighting.is_given else state
     return add_map(state, display_name(Path(lighting.light).name), read_light(lighting.light))
 
 
@@ -92,8 +91,8 @@ def qualities(model: Model) -> dict[str, tuple[Quality, int]]:
 
 def add_map(state: State, name: str, light: Light) -> State:
     """The state with one more map, which is chosen; one of the same name is replaced."""
-    lighting = dataclasses.replace(state.lighting, light=name)
-    return dataclasses.replace(state, lighting=lighting, maps={**state.maps, name: light}, stale=True)
+    with_map = dataclasses.replace(state, maps={**state.maps, name: light})
+    return relight(with_map, dataclasses.replace(state.lighting, light=name))
 
 
 def read_lighting(state: State, choice: Any, yaw: Any, exposure: Any) -> Lighting:
@@ -106,30 +105,31 @@ def read_lighting(state: State, choice: Any, yaw: Any, exposure: Any) -> Lightin
     return dataclasses.replace(state.lighting, light=light, light_yaw=turn, exposure=stops)
 
 
-def make_light(state: State) -> State:
-    """The state with the light of its options as they are now."""
-    if not state.stale:
-        return state
-    light = light_of_options(state.lighting, lambda name: state.maps.get(name) or LIGHT_OF_PACKAGE(name))
-    return dataclasses.replace(state, light=light, stale=False)
+def relight(state: State, lighting: Lighting) -> State:
+    """The state in the light of the options."""
+
+    def make() -> Light:
+        return light_of_options(lighting, lambda name: state.maps.get(name) or LIGHT_OF_PACKAGE(name))
+
+    return dataclasses.replace(state, lighting=lighting, light=cache(make))
 
 
-def draw(model: Model, state: State, moving: bool) -> tuple[State, np.ndarray | None]:
-    """(the state with its light made, the canvas, uint8): none before the browser said its view.
+def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
+    """The canvas, uint8; None before the browser said its view.
 
     Moving: `draft`, at the network's own size.  At rest: the chosen quality.
     """
     if (view := state.view) is None:
-        return state, None
-    state, named = make_light(state), qualities(model)
+        return None
+    named = qualities(model)
     quality: Quality
     quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
     behind = state.lighting.background
     reach = square_reach(view, whole=behind != "white")
-    camera = square_camera(view, state.volume, reach, size)
-    rendering = model.render(state.volume, camera, quality, state.light)
-    square = images.to_uint8(before(behind, rendering, camera, state.light).image)
-    return state, fill(square, view, reach, MOVING_LONGEST if moving else LONGEST)
+    camera, light = square_camera(view, state.volume, reach, size), state.light()
+    rendering = model.render(state.volume, camera, quality, light)
+    square = images.to_uint8(before(behind, rendering, camera, light).image)
+    return fill(square, view, reach, MOVING_LONGEST if moving else LONGEST)
 
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:

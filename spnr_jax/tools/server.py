@@ -36,7 +36,7 @@ from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.methods import method_of
 from spnr_jax.tools import frame
-from spnr_jax.tools.commands import View
+from spnr_jax.tools.commands import Lighting, View
 from spnr_jax.tools.frame import State
 from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
@@ -116,9 +116,9 @@ REST = 0.2  # seconds without a change after which the better picture is drawn
 
 
 class Loop(Generic[Shown]):
-    """Draws `show(state, moving)` after changes (moving), and when none came for `rest` seconds (not moving)."""
+    """Calls `show(state, moving)` after changes (moving), and when none came for `rest` seconds (not moving)."""
 
-    def __init__(self, state: Shown, show: Callable[[Shown, bool], Shown], rest: float = REST) -> None:
+    def __init__(self, state: Shown, show: Callable[[Shown, bool], None], rest: float = REST) -> None:
         self.state, self.stopped = state, False
         self._show, self._rest = show, rest
         self._changes: list[Callable[[Shown], Shown]] = []
@@ -146,7 +146,7 @@ class Loop(Generic[Shown]):
     def _run(self) -> None:
         moving = True
         while not self.stopped:
-            self.state = self._show(self.state, moving)
+            self._show(self.state, moving)
             with self._wake:
                 self._wake.wait_for(lambda: self.is_superseded, self._rest if moving else None)
                 changes, self._changes = self._changes, []
@@ -203,17 +203,19 @@ class Browser:
         if seen is not None:
             self._replace(view=seen)
 
-    def _draw(self, state: State, moving: bool) -> State:
+    def _draw(self, state: State, moving: bool) -> None:
         with self._network:
-            state, canvas = frame.draw(self._model, state, moving)
+            canvas = frame.draw(self._model, state, moving)
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
             self._said.content = self._said.content.replace(PREPARING, "")
-        return state
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))
+
+    def _relight(self, lighting: Lighting) -> None:
+        self.loop.submit(lambda state: frame.relight(state, lighting))
 
     def _try(self, work: Callable[[], None]) -> None:
         """Do the work of a control; what a person can mend becomes a note in the browser."""
@@ -247,7 +249,7 @@ class Browser:
         async def move(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself chooses a new map
                 said = {name: control.value for name, control in self._light.items()}
-                self._try(lambda: self._replace(lighting=frame.read_lighting(self.loop.state, **said), stale=True))
+                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **said)))
 
         for control in self._light.values():
             control.on_update(move)
@@ -268,7 +270,7 @@ class Browser:
     def _save(self) -> None:
         state = self.loop.state
         with self._network:
-            canvas = frame.draw(self._model, state, moving=False)[1]
+            canvas = frame.draw(self._model, state, moving=False)
         if canvas is not None:
             name = f"{state.name.rpartition('.')[0] or 'view'}.png"
             self._client.send_file_download(name, images.png(canvas), save_immediately=True)

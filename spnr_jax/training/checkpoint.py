@@ -138,9 +138,7 @@ def restore(
                 words = f"is damaged or of another version ({first_line(error)}); trying the one before"
                 say(f"checkpoint {folder / str(step)} {words}")
                 continue
-            if int(state.step) == step:
-                return state
-            say(f"checkpoint {folder / str(step)} holds step {int(state.step)}; trying the one before")
+            return state
     if steps:
         raise UserError(
             f"{run / 'checkpoints'}: no checkpoint of this run can be read; remove the folder to start again"
@@ -148,13 +146,11 @@ def restore(
     return None
 
 
-def load_run(
-    run: Path | str, say: Callable[[str], None] = print, data: Path | str = "DATA"
-) -> tuple[TrainConfig, optimisation.TrainState]:
-    """Config and newest readable state of a run; ValueError, with what to do, if it has no state (`data` is named)."""
+def load_run(run: Path | str, say: Callable[[str], None] = print) -> tuple[TrainConfig, optimisation.TrainState]:
+    """Config and newest readable state of a run; ValueError, with what to do, if it has no state."""
     run = Path(run)
     config = read_config(run)
     state = restore(run, config, say)
     if state is None:
-        raise UserError(f"{run}: the run has no checkpoint yet; go on with `spnr train {data} {run}`")
+        raise UserError(f"{run}: the run has no checkpoint yet; go on with `spnr train DATA {run}`")
     return config, state

@@ -12,10 +12,10 @@ import math
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,6 @@ from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
-Phase = Literal["step", "row", "preview", "checkpoint", "end"]
-OnEvent = Callable[[Phase, int, Any], object]  # phase that begins, steps done, its batch or row
-
 
 class NotFinite(UserError):
     """A loss is NaN or infinite; the message names step and quantity."""
@@ -50,18 +47,17 @@ def train(
     schedule: Schedule,
     mesh: Mesh | None = None,
     init: Trained | None = None,
-    on_event: OnEvent | None = None,
     light: Light | None = None,
 ) -> optimisation.TrainState:
     """The state after the config's last step; goes on where an earlier call left the run folder.
 
-    A new run begins with random weights, or those of `init`.  `mesh` divides batches among devices.  `on_event` is
-    told what the loop is about to do.  `light` is that of the data set's pictures, where it is not the room.
+    A new run begins with random weights, or those of `init`.  `mesh` divides batches among devices.  `light` is
+    that of the data set's pictures, where it is not the room.
     """
     runtime.few_arenas()
     programs.check_divides(mesh, config.batch_objects)
-    tell = on_event or (lambda *event: None)
-    with claim(run, config), ExitStack() as stack:
+    with checkpoint.alone(run), ExitStack() as stack:
+        checkpoint.write_config(run, config)
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
@@ -73,7 +69,6 @@ def train(
         for step, batch in enumerate(batches, start=first):
             if first < step == joins:
                 tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
-            tell("step", step, batch)
             state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
             done = step + 1
             log.step(done, metrics)
@@ -83,10 +78,8 @@ def train(
                 row = log.mean()
                 if save:
                     check_state(state)
-                tell("row", done, row)
                 log.write(row)
             if last or done % schedule.preview_every == 0:
-                tell("preview", done, None)
                 with log.paused():
                     scores, picture = preview(state, config, dataset, run, light)
                     runtime.give_back()
@@ -94,11 +87,8 @@ def train(
             if last:
                 write_network(run, config, state)
             if save:  # after the rows up to this step, which a run that goes on from here will not write again
-                tell("checkpoint", done, None)
                 with log.paused():
                     checkpoint.save(run, state)
-            if last or stopping:
-                tell("end", done, None)
             if stopping and not last:
                 words = f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
                 raise KeyboardInterrupt(words)
@@ -112,18 +102,6 @@ def take_step(
     with programs.using(mesh):
         batch = programs.place_batch(batch, mesh)
         return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
-
-
-@contextmanager
-def claim(run: Path, config: TrainConfig) -> Iterator[None]:
-    """The run folder is this training's alone; errors of the disk name it."""
-    try:
-        with checkpoint.alone(run):
-            checkpoint.write_config(run, config)
-            yield
-    except OSError as error:
-        error.filename = error.filename or str(run)  # writing to a full disk does not say where
-        raise
 
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:

@@ -61,10 +61,10 @@ def place(source: Path | str | None) -> Path:
     return packaged_file() if source is None or str(source) == SHIPPED else Path(source)
 
 
-def read_trained(source: Path | str | None, say: Callable[[str], None] = print, data: Path | str = "DATA") -> Trained:
+def read_trained(source: Path | str | None, say: Callable[[str], None] = print) -> Trained:
     """The network of a run folder's newest checkpoint, of a file of weights, or of the package (None, or its name).
 
-    ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint, `data` is named.
+    ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint.
     """
     path = place(source)
     if path.suffix == ".npz":
@@ -72,7 +72,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print, 
         return replace(trained, variables=add_companions(trained.config.model, trained.variables, path.parent))
     from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
 
-    config, state = checkpoint.load_run(path, say, data)
+    config, state = checkpoint.load_run(path, say)
     variables = add_companions(config.model, optimisation.averaged_variables(state), path)
     return Trained(config=config, variables=variables, steps=int(state.step))
 

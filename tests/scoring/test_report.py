@@ -85,7 +85,6 @@ METRICS_JSON = {
     "methods": table(),
     "ours_minus": differences(),
     "seconds": {"train": 372.0, "total": 8000.0},
-    "per_category": {},
     "preset": "tiny",
     "steps": 99,
     "seed": 7,
@@ -145,10 +144,8 @@ def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     assert page.all("td").count("+3.12") == 2
     assert {"[-0.50, +6.75]", "p = 0.012"} <= set(page.all("small"))
     sure = {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}
-    page = write(tmp_path, ours_minus={"splat": sure, "white": sure}, per_category={"<car>": table()})
+    page = write(tmp_path, ours_minus={"splat": sure, "white": sure})
     assert "p < 0.001" in page.all("small")
-    assert "<car>" in page.all("th"), "categories have a table of their own"
-    assert page.all("b").count("21.12") == 2
 
 
 def test_the_page_says_everywhere_which_objects_it_scores(tmp_path):
@@ -180,7 +177,7 @@ class TestEvaluation:
 
     def test_metrics_json_has_exactly_these_keys_and_the_report_the_best_floor(self, outcome, tmp_path):
         metrics = self.written(tmp_path, outcome)
-        keys = "methods paper_minus seconds preset steps seed hardware settings per_category"
+        keys = "methods paper_minus seconds preset steps seed hardware settings"
         assert set(metrics) == set(keys.split())
         assert set(metrics["methods"]) == {"paper", "white", "splat", "nearest"}
         assert all(set(values) == NUMBERS for values in metrics["methods"].values())

@@ -67,13 +67,6 @@ def step(state, config=CONFIG, data=BATCH):
     )
 
 
-def run(state, steps, config=CONFIG, data=BATCH):
-    """State and metrics after so many steps on one batch."""
-    for _ in range(steps):
-        state, metrics = step(state, config, data)
-    return state, metrics
-
-
 def near(actual, expected):
     """Gradients agree to a thousandth of the largest entry of each leaf."""
     for ours, theirs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):

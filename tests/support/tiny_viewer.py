@@ -1,4 +1,4 @@
-"""An untrained ray-marching network and points; surfels of a ball and a view: what the tests of the viewer look at."""
+"""Surfels of a ball and a view: what the tests of the viewer look at."""
 
 import dataclasses
 import functools
@@ -9,30 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method import inference, surfel_method
+from spnr_jax.method import surfel_method
 from spnr_jax.method.model import Model
 from spnr_jax.tools import frame
 from spnr_jax.tools.commands import Lighting
 from spnr_jax.tools.frame import OPENCV, State, View
-from support import surfel_clouds, tiny_model
+from support import surfel_clouds
 
 RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
-
-
-@functools.cache
-def model() -> Model:
-    """The network of the tests, its weights away from zero."""
-    weights = jax.jit(inference.network(tiny_model.MODEL).init)(
-        jax.random.key(0), tiny_model.cloud(), tiny_model.camera()
-    )
-    return Model(config=tiny_model.MODEL, variables=tiny_model.wobbled(weights, 4))
-
-
-def cloud() -> PointCloud:
-    """Red points in the half with x < 5, blue ones beyond, in units far from the box's."""
-    x, y, z = np.random.default_rng(0).uniform(0, 10, (3, 200)).astype(np.float32)
-    color = np.where(x[:, None] < 5, np.float32(RED), np.float32(BLUE))
-    return surfel_clouds.cloud(np.stack([x, y, z], axis=1), base_color=color)
 
 
 @functools.cache
@@ -68,14 +52,15 @@ def view(azimuth: float = 0.0, width: int = 120, height: int = 60) -> View:
     return made
 
 
-def state(**changes) -> State:
+def state(lighting: Lighting | None = None, **changes) -> State:
     """The cloud as a browser sees it."""
-    return dataclasses.replace(opened(), **{"view": view()} | changes)
+    made = dataclasses.replace(opened(), **{"view": view()} | changes)
+    return made if lighting is None else frame.relight(made, lighting)
 
 
 def canvas(moving=False, **changes) -> np.ndarray:
     """The frame of a state, int."""
-    return frame.draw(surfels(), state(**changes), moving)[1].astype(int)
+    return frame.draw(surfels(), state(**changes), moving).astype(int)
 
 
 def viewer(host="127.0.0.1", port=0, reached_at=None):

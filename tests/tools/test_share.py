@@ -1,4 +1,4 @@
-"""`spnr export --splats`, `--mesh` and `spnr share`: what they write, and what they refuse in one line."""
+"""`spnr export --splats` and `spnr share`: what they write, and what they refuse in one line."""
 
 from pathlib import Path
 
@@ -8,11 +8,9 @@ from support import command_line, splat_balls, tiny_surfels
 
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.method import surfel_method
 from spnr_jax.surfels.gaussians import View
-from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import export, surfaces
 from spnr_jax.tools.commands import Lighting, Render
 
@@ -56,24 +54,6 @@ def test_splats_of_a_file_lie_around_its_points_in_its_units(cloud, tmp_path, ca
     note = "ball.ply, drawn by spnr_jax"
     assert note.encode() in out.read_bytes()[:300]
     assert "splats" in capsys.readouterr().out
-
-
-def test_the_mesh_of_a_file_lies_around_its_points_in_its_units(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(surfaces.draw_around, "__defaults__", (None, 16, 64))
-    monkeypatch.setattr(surfaces.mesh_of_volume, "__defaults__", (40,))
-    cloud, out = tmp_path / "ball.xyz", tmp_path / "new" / "ball.glb"
-    np.savetxt(cloud, 3 * spiral(1000) + [5, 0, 0])
-    code = command_line.exit_code(cli, "export", cloud, "--mesh", out, "--up", "y", "--network", tiny_surfels.run())
-    said = capsys.readouterr()
-    assert code == 0, said.err
-    assert f"wrote {out} (" in said.out
-    assert "watertight" in said.out
-    points = read_cloud(cloud).positions
-    vertices = np.concatenate([part.positions for part in load_mesh(out).parts])
-    spare = 0.08 * np.ptp(points, axis=0).max()  # three steps of the grid
-    for end in (np.min, np.max):
-        np.testing.assert_allclose(end(vertices, axis=0), end(points, axis=0), atol=spare)
-    assert [path.name for path in out.parent.iterdir()] == ["ball.glb"]
 
 
 @pytest.mark.parametrize(("command", "option", "name"), [("export", "--splats", "a.ply"), ("share", "--out", "a.html")])

@@ -92,9 +92,7 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
     np.savetxt(tmp_path / "ball.txt", np.concatenate([points, stripes], axis=1), fmt="%.5f")
     making = SplatMaking(fitting_views=12, most_splats=8000)
     options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
-    lines: list[str] = []
-    export.share(options, lambda line: None, lines.append)
-    assert lines[-1].startswith(f"wrote {options.out} (")
+    assert export.share(options, lambda line: None).startswith(f"wrote {options.out} (")
     poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())
     network = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1])))) / np.float32(255)
     with opened(chromium, options.out) as tab:

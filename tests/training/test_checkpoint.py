@@ -79,14 +79,6 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage
     assert "\n" not in said[0]
 
 
-def test_a_checkpoint_of_another_step_under_this_name_is_not_taken(run):
-    shutil.rmtree(run / "checkpoints" / "6")
-    shutil.copytree(run / "checkpoints" / "2", run / "checkpoints" / "6")
-    said = []
-    assert int(checkpoint.restore(run, CONFIG, said.append).step) == 4
-    assert len(said) == 1
-
-
 def test_a_run_whose_checkpoints_are_all_damaged_is_one_clear_error(run):
     for step in (2, 4, 6):
         for path in newest_files(run, step):

@@ -99,7 +99,7 @@ def test_while_things_move_the_draft_is_drawn_and_at_rest_what_was_chosen(monkey
 
 
 def test_nothing_is_drawn_before_the_browser_said_where_it_looks_from():
-    assert frame.draw(surfels(), state(view=None), moving=False)[1] is None
+    assert frame.draw(surfels(), state(view=None), moving=False) is None
 
 
 # light
@@ -109,14 +109,14 @@ def test_a_change_of_the_light_changes_the_picture():
     before = canvas()
     seen = [before]
     for asked in (Lighting(light="night"), Lighting(light_yaw=90.0), Lighting(sun=(0.0, 20.0)), Lighting(exposure=1.0)):
-        now = canvas(lighting=asked, stale=True)
+        now = canvas(lighting=asked)
         assert all(np.abs(now - old).max() > 8 for old in seen), asked
         seen.append(now)
     np.testing.assert_array_equal(canvas(), before)
 
 
 def test_the_map_stands_behind_the_object_on_the_whole_canvas_where_it_is_asked_for():
-    white, lit = (canvas(lighting=Lighting(light="sunset", background=b), stale=True) for b in ("white", "light"))
+    white, lit = (canvas(lighting=Lighting(light="sunset", background=b)) for b in ("white", "light"))
     assert (white[:4, :4] == 255).all()
     assert lit[:4, :4].mean() < 240
     assert lit[:, -4:].mean() < 240
@@ -145,15 +145,12 @@ def test_controls_that_say_what_they_do_not_offer_are_refused_in_one_line(contro
     assert "\n" not in str(refused.value)
 
 
-def test_a_light_is_made_once_and_a_new_map_is_chosen_and_replaces_one_of_its_name(monkeypatch):
-    assert frame.make_light(opened()).light is None
+def test_a_new_map_is_chosen_and_replaces_one_of_its_name():
+    assert opened().light() is None
     one = frame.add_map(state(lighting=Lighting(exposure=1.0)), "a.hdr", lopsided())
     assert (one.light_name, one.lights) == ("a.hdr", (*NAMES, "a.hdr"))
-    made = frame.make_light(one)
-    close(made.light.tables, 2 * lopsided().tables)
-    close(frame.make_light(frame.add_map(one, "a.hdr", lopsided(3.0))).light.tables, 6 * lopsided().tables)
-    monkeypatch.setattr(frame, "light_of_options", lambda *_: pytest.fail("the light was made again"))
-    assert frame.make_light(made).light is made.light
+    close(one.light().tables, 2 * lopsided().tables)
+    close(frame.add_map(one, "a.hdr", lopsided(3.0)).light().tables, 6 * lopsided().tables)
 
 
 # files

@@ -16,7 +16,6 @@ def test_changes_are_applied_in_order_drawn_at_once_and_once_more_at_rest():
         drawn.append((tuple(numbers), moving))
         if numbers and not moving:
             rested.set()
-        return numbers
 
     loop = Loop([], show, rest=0.05)
     for number in range(5):
@@ -41,7 +40,6 @@ def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_
         drawn.append(number)
         if number == 3:
             loop.stop()
-        return number
 
     loop = Loop(0, show, rest=10.0)
     loop.start()
