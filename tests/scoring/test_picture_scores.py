@@ -12,7 +12,6 @@ from support.laws import close, numbers
 
 from spnr_jax.scoring import picture_scores
 from spnr_jax.scoring.picture_scores import (
-    METRICS,
     difference,
     differences,
     flip,
@@ -125,15 +124,6 @@ class TestTables:
         row = summarise(results)["a"]
         assert [row[name] for name in ("cpsnr", "cpsnr_interval", "lpips", "lpips_interval")] == [None] * 4
         assert differences(results, "a")["b"]["cpsnr"] is differences(results, "a")["b"]["lpips"] is None
-
-    def test_every_metric_has_its_interval_and_one_object_has_none(self):
-        results = [{"a": scores_of(x, x + 1)} for x in (10, 20, 40)]
-        row = summarise(results)["a"]
-        assert row["psnr_interval"] == interval([r["a"]["psnr"] for r in results])
-        for name in METRICS[:-2]:
-            low, high = row[f"{name}_interval"]
-            assert low < row[name] < high
-        assert summarise(results[:1])["a"]["psnr_interval"] is None
 
     def test_differences_are_those_of_one_method_to_every_other(self):
         rng = np.random.default_rng(0)
