@@ -67,6 +67,7 @@ REFUSED = [  # command, what its line says
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
     ("render point.xyz --run RUN", "holds 1 points in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),
+    ("render a.ply b.ply b/a.xyz", "two clouds have one name"),
     ("render . --run RUN", ".: a folder; expected a file of one of"),
     (f"{LIT} --elevation 91", "--elevation: expected -90 to 90, got 91"),
     (f"{LIT} --views -1", "--views: expected 0 or more, got -1"),

@@ -21,6 +21,8 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import binary_erosion, distance_transform_edt, gaussian_filter
 
 from experiments import entry_point
 from experiments.comparison import contenders, results_folder, scores
@@ -31,11 +33,13 @@ from experiments.comparison.study_objects import cut
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.data_sets import Dataset, ObjectData
+from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.picture_scores import ball, ball_waves, blue_share, plate, sharpness, under_true_opacity
+from spnr_jax.scoring.picture_scores import WELL_INSIDE, sharpness
 from spnr_jax.scoring.report import Cell, Table, number
 
 COLUMNS = {
@@ -44,6 +48,10 @@ COLUMNS = {
     "inside_true_opacity": ("inside, true opacity", 2),
 }
 KNOWN_SIZE = 512  # pixels along each side of ball and plate
+COVERED = 0.3  # opacity from which on a picture's colour is told
+WAVES = 8.0  # standard deviation of the Gaussian whose residue are waves
+GREY = 0.5  # base colour of the ball
+PLATE = (2.0, 1.4, 0.03)  # sides
 HEADS = (*(head for head, _ in COLUMNS.values()), "encode, s", "a picture, s", "ball: waves", "plate: blue share")
 
 
@@ -123,6 +131,23 @@ def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, fl
     return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode, "render": render}
 
 
+def under_true_opacity(
+    image: Float[np.ndarray, "height width 3"],
+    opacity: Float[np.ndarray, "height width"],
+    reference: Float[np.ndarray, "height width 4"],
+) -> Float[np.ndarray, "height width 3"]:
+    """The picture's own colours under the reference's opacity: what it would be with perfect outlines, no holes.
+
+    Where the picture shows little or nothing it takes the colour of the nearest pixel that it covers.
+    """
+    color = (image - 1 + opacity[..., None]) / np.maximum(opacity[..., None], COVERED)
+    shown = opacity >= COVERED
+    if shown.any():
+        color = color[tuple(distance_transform_edt(~shown, return_distances=False, return_indices=True))]
+    alpha = reference[..., 3:]
+    return np.clip(color, 0, 1) * alpha + 1 - alpha
+
+
 def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     """PSNR of the same colours under the true opacity."""
     found = []
@@ -134,6 +159,44 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
         "psnr_true_opacity": [one.psnr for one in found],
         "inside_true_opacity": [one.psnr_inside for one in found],
     }
+
+
+def ball(count: int, seed: int = 0) -> PointCloud:
+    """Random points of a grey ball: its picture should be smooth."""
+    towards = np.random.default_rng(seed).standard_normal((count, 3))
+    towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    return plain_cloud(towards, GREY, towards)
+
+
+def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
+    """Root mean square of what a wide Gaussian takes away of the ball, away from its outline."""
+    inside = binary_erosion(opacity > 0.5, iterations=int(3 * WAVES))
+    grey = image.mean(axis=-1)
+    return float(np.mean((grey - gaussian_filter(grey, WAVES))[inside] ** 2) ** 0.5) if inside.any() else float("nan")
+
+
+def plate(count: int, seed: int = 0) -> PointCloud:
+    """Random points of a thin plate, red in front (+z) and blue behind and at the rims."""
+    generator = np.random.default_rng(seed)
+    width, height, depth = PLATE
+    areas = np.array([width * height] * 2 + [width * depth] * 2 + [height * depth] * 2)
+    side = generator.choice(6, count, p=areas / areas.sum())
+    places = generator.uniform(-0.5, 0.5, (count, 3))
+    axis, sign = np.array([2, 2, 1, 1, 0, 0])[side], np.where(side % 2 == 0, 0.5, -0.5)
+    places[np.arange(count), axis] = sign
+    normals = np.zeros((count, 3), np.float32)
+    normals[np.arange(count), axis] = 2 * sign
+    color = np.where((side == 0)[:, None], [0.8, 0.05, 0.05], [0.05, 0.05, 0.8])
+    return plain_cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
+
+
+def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
+    """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
+    inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
+    if not inside.any():
+        return float("nan")
+    red, _, blue = srgb_to_linear(image)[inside].mean(axis=0)
+    return float(blue / (red + blue))
 
 
 def _score_known(

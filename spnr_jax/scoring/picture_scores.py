@@ -22,11 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from flip_evaluator import evaluate
 from jaxtyping import Float, Int
-from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
 
-from spnr_jax.formats.columns import srgb_to_linear
-from spnr_jax.kernels.cloud_arrays import plain_cloud
-from spnr_jax.kernels.records import AnyArray, PointCloud
+from spnr_jax.kernels.records import AnyArray
 
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180  # 67.02: a 4K screen 0.7 m wide, seen from 0.7 m
 NO_LPIPS = "n/a (pip install lpips)"
@@ -186,11 +184,7 @@ def _by_object(scores: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, " object
 OUTLINE = 3  # pixels to both sides of the true outline
 WELL_INSIDE = 4  # pixels from the outline
 SOLID = 0.9  # opacity below which a pixel well inside is a hole
-COVERED = 0.3  # opacity from which on a picture's colour is told
 DETAIL = 3.0  # standard deviation of the Gaussian whose residue is detail
-WAVES = 8.0  # the same for the ball
-GREY = 0.5  # base colour of the ball
-PLATE = (2.0, 1.4, 0.03)  # sides
 
 
 class Sharpness(NamedTuple):
@@ -223,23 +217,6 @@ def sharpness(
     )
 
 
-def under_true_opacity(
-    image: Float[np.ndarray, "height width 3"],
-    opacity: Float[np.ndarray, "height width"],
-    reference: Float[np.ndarray, "height width 4"],
-) -> Float[np.ndarray, "height width 3"]:
-    """The picture's own colours under the reference's opacity: what it would be with perfect outlines, no holes.
-
-    Where the picture shows little or nothing it takes the colour of the nearest pixel that it covers.
-    """
-    color = (image - 1 + opacity[..., None]) / np.maximum(opacity[..., None], COVERED)
-    shown = opacity >= COVERED
-    if shown.any():
-        color = color[tuple(distance_transform_edt(~shown, return_distances=False, return_indices=True))]
-    alpha = reference[..., 3:]
-    return np.clip(color, 0, 1) * alpha + 1 - alpha
-
-
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if values.size else float("nan")
 
@@ -259,40 +236,3 @@ def _correlation(one: np.ndarray, other: np.ndarray) -> float:
     if one.size < 2 or one.std() == 0 or other.std() == 0:
         return float("nan")
     return float(np.corrcoef(one, other)[0, 1])
-
-
-def ball(count: int, seed: int = 0) -> PointCloud:
-    """Random points of a grey ball: its picture should be smooth."""
-    towards = np.random.default_rng(seed).standard_normal((count, 3))
-    towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
-    return plain_cloud(towards, GREY, towards)
-
-
-def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
-    """Root mean square of what a wide Gaussian takes away of the ball, away from its outline."""
-    inside = binary_erosion(opacity > 0.5, iterations=int(3 * WAVES))
-    return _mean(_residue(image, WAVES)[inside] ** 2) ** 0.5
-
-
-def plate(count: int, seed: int = 0) -> PointCloud:
-    """Random points of a thin plate, red in front (+z) and blue behind and at the rims."""
-    generator = np.random.default_rng(seed)
-    width, height, depth = PLATE
-    areas = np.array([width * height] * 2 + [width * depth] * 2 + [height * depth] * 2)
-    side = generator.choice(6, count, p=areas / areas.sum())
-    places = generator.uniform(-0.5, 0.5, (count, 3))
-    axis, sign = np.array([2, 2, 1, 1, 0, 0])[side], np.where(side % 2 == 0, 0.5, -0.5)
-    places[np.arange(count), axis] = sign
-    normals = np.zeros((count, 3), np.float32)
-    normals[np.arange(count), axis] = 2 * sign
-    color = np.where((side == 0)[:, None], [0.8, 0.05, 0.05], [0.05, 0.05, 0.8])
-    return plain_cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
-
-
-def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
-    """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
-    inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
-    if not inside.any():
-        return float("nan")
-    red, _, blue = srgb_to_linear(image)[inside].mean(axis=0)
-    return float(blue / (red + blue))

@@ -173,6 +173,8 @@ class Render(Reading):
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         super().__post_init__()
+        names = [cloud.stem for cloud in (self.cloud, *self.others)]
+        require(len(set(names)) == len(names), "two clouds have one name; give them an --out each")
         at_least(self, 0, "views")
         at_least(self, 1, "frames", "fps")
         within(self, -90, 90, "elevation")

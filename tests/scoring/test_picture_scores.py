@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.laws import close, numbers
 
+from experiments.studies.sharpness import under_true_opacity
 from spnr_jax.scoring import picture_scores
 from spnr_jax.scoring.picture_scores import (
     difference,
@@ -18,7 +19,6 @@ from spnr_jax.scoring.picture_scores import (
     interval,
     lpips,
     summarise,
-    under_true_opacity,
 )
 
 IMAGE = np.asarray(numbers(0, 2, 3, 40, 36, 3, low=0.0))
