@@ -35,6 +35,8 @@ from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
+GOES_ON = "the same command goes on from there"
+
 
 class NotFinite(UserError):
     """A loss is NaN or infinite; the message names step and quantity."""
@@ -66,19 +68,17 @@ def train(
         log = stack.enter_context(closing(MetricsLog(run, first, config.num_steps)))
         batches = stack.enter_context(closing(batches_from(first)))
         joins = optimisation.first_adversarial_step(config)
-        for step, batch in enumerate(batches, start=first):
-            if first < step == joins:
-                tqdm.write(f"step {step}: the discriminator joins; the training step is compiled anew")
-            state, metrics = take_step(state, batch, config, mesh, adversarial=step >= joins)
-            done = step + 1
+        for done, batch in enumerate(batches, start=first + 1):
+            if first < joins == done - 1:
+                tqdm.write(f"step {joins}: the discriminator joins; the training step is compiled anew")
+            state, metrics = take_step(state, batch, config, mesh, adversarial=done > joins)
             log.step(done, metrics)
             last, stopping = done == config.num_steps, bool(requests)
             save = last or stopping or done % schedule.checkpoint_every == 0
             if save or done % schedule.log_every == 0:
-                row = log.mean()
-                if save:
-                    check_state(state)
-                log.write(row)
+                log.write(log.mean())
+            if save:
+                check_state(state)
             if last or done % schedule.preview_every == 0:
                 with log.paused():
                     scores, picture = preview(state, config, dataset, run, light)
@@ -90,8 +90,7 @@ def train(
                 with log.paused():
                     checkpoint.save(run, state)
             if stopping and not last:
-                words = f"stopped at step {done} of {config.num_steps}; the same command goes on from there"
-                raise KeyboardInterrupt(words)
+                raise KeyboardInterrupt(f"stopped at step {done} of {config.num_steps}; {GOES_ON}")
     return state
 
 
