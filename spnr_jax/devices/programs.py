@@ -19,13 +19,14 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import numpy as np
 from jax import export
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from spnr_jax.devices.runtime import make_room
 from spnr_jax.errors import UserError
 
 # --- many devices -----------------------------------------------------------------------------------------------------
@@ -99,6 +100,8 @@ _registered: set[type] = set()
 class Kept:
     """A function under `jax.jit` whose traces are kept; for arrays of the host, calls in other traces pass it by."""
 
+    all: ClassVar[list[Self]] = []
+
     def __init__(
         self,
         function: Callable[..., Any],
@@ -114,18 +117,28 @@ class Kept:
         self.function, self.options = function, options
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self.programs: dict[Any, Callable[..., Any]] = {}
+        Kept.all.append(self)
 
     def __call__(self, *args: Any, **static: Any) -> Any:
         """What the function gives."""
         leaves, tree = jax.tree.flatten(args)
-        place = jax.config.values["jax_compilation_cache_dir"]
-        if place is None or not all(_is_plain(leaf) for leaf in leaves):
+        if not all(_is_plain(leaf) for leaf in leaves):
             return self.jitted(*args, **static)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(sorted(static.items()))
         if key not in self.programs:
-            trace = self._load(Path(place), tree, leaves, static, key)
-            self.programs[key] = jax.jit(trace.call, compiler_options=self.options)
+            if make_room():
+                for kept in Kept.all:
+                    kept.programs.clear()
+            self.programs[key] = self._program(tree, leaves, static, key)
         return self.programs[key](*leaves)
+
+    def _program(self, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> Callable[..., Any]:
+        """A function of the leaves: from a trace where programs are kept on the disk."""
+        place = jax.config.values["jax_compilation_cache_dir"]
+        if place is None:
+            return lambda *leaves: self.jitted(*jax.tree.unflatten(tree, leaves), **static)
+        trace = self._load(Path(place), tree, leaves, static, key)
+        return jax.jit(trace.call, compiler_options=self.options)
 
     def _load(self, place: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
         """The trace for such arguments: that on the disk, or a new one, which is written there."""

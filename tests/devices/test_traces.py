@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.laws import close
 
-from spnr_jax.devices import programs
+from spnr_jax.devices import programs, runtime
 from spnr_jax.kernels.records import Rays
 
 CALLS = []
@@ -78,3 +78,18 @@ def test_inside_other_transformations_it_is_the_function(folder):
     close(function(RAYS, SHIFT, times=3), EXPECTED)
     gradient = jax.grad(lambda shift: jnp.sum(function(RAYS, shift, times=3).origins))(jnp.asarray(SHIFT))
     close(gradient, np.full(3, 2.0))
+
+
+def test_programs_are_dropped_before_the_memory_maps_of_the_process_run_out(folder, monkeypatch):
+    """Three maps of each kernel stay until then; what is dropped computes the same when it is called again."""
+    program = jax.jit(lambda x: CALLS.append(x) or 2 * x)
+    program(SHIFT)
+    runtime.make_room()
+    program(SHIFT)
+    assert len(CALLS) == 1, "a process with few maps has dropped a program"
+    monkeypatch.setattr(runtime, "FULL", 0.0)
+    for place in (str(folder), None):
+        jax.config.update("jax_compilation_cache_dir", place)
+        close(kept()(RAYS, SHIFT, times=3), EXPECTED)
+        program(SHIFT)
+    assert len([call for call in CALLS if not isinstance(call, int)]) == 3, "each new program of Kept makes room"
