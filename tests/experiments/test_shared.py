@@ -1,20 +1,16 @@
-"""What every experiment stands on: networks, scores, differences, budgets, tables, a folder that goes on."""
+"""What every experiment stands on: networks, scores, tables, a folder that goes on."""
 
 import dataclasses
-from itertools import chain
 
 import numpy as np
 import pytest
 from support import stand_ins, tiny_dataset
-from support.tiny_baselines import BASELINE, SHRUNKEN
 
-from experiments.comparison import budget as budgets
 from experiments.comparison import results_folder, scores, study_objects, variants
 from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.report import Table, number, text
-from spnr_jax.training import batching, checkpoint, optimisation
 
 ROWS = (
     ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
@@ -87,43 +83,11 @@ def test_small_pictures_are_enlarged_and_the_reference_itself_is_right():
     assert scores.mean_scores({"a": [1.0, np.nan], "b": [np.nan]}) == {"a": 1.0, "b": None}
 
 
-def test_scores_inside_the_silhouette_do_not_see_the_rest():
+def test_a_picture_is_as_sharp_as_itself():
     item = tiny_dataset.one_object("chair")
     reference = data_sets.on_white(item.images)
-    spoilt = np.where(item.images[..., 3:] <= 127, np.float32(0.5), reference)
-    found = variants.more_scores(item, evaluation.Pictures(image=spoilt, acc=spoilt[..., 0]))
-    np.testing.assert_allclose(found["inside"], 100.0)
-    equal = variants.more_scores(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
+    equal = variants.measure_detail(item, evaluation.Pictures(image=reference, acc=reference[..., 0]))
     np.testing.assert_allclose(equal["detail"], 1.0, rtol=1e-5)
-
-
-def test_minutes_become_steps_at_the_pace_of_both_kinds_of_step(monkeypatch):
-    monkeypatch.setattr(budgets, "step_seconds", lambda config, dataset, adversarial: 0.3 if adversarial else 0.1)
-    half = dataclasses.replace(tiny_dataset.CONFIG, num_steps=10)  # the discriminator joins after half of the steps
-    assert budgets.steps_within(60, half, None) == 300
-    assert budgets.steps_within(60, BASELINE, None) == 600
-    assert budgets.steps_within(0.01, BASELINE, None) == 1
-
-
-def test_the_pace_leaves_out_the_step_that_compiles(monkeypatch):
-    ticks = chain([100.0, 101.0, 103.0, 106.0], iter(lambda: 106.0, None))
-    monkeypatch.setattr(budgets, "PACE_SECONDS", 5.0)
-    monkeypatch.setattr(optimisation, "jitted_create_state", lambda config: "state")
-    monkeypatch.setattr(optimisation, "jitted_train_step", lambda state, batch, **_: (state, 1.0))
-    monkeypatch.setattr(batching, "batches", lambda *_: (i for i in range(9)))
-    # asked at the third, fourth... step after the first: 101 and 103 are too early
-    pace = budgets.step_seconds(BASELINE, None, adversarial=False, clock=lambda: next(ticks))
-    assert pace == pytest.approx(6.0 / 5)
-
-
-def test_a_run_that_was_begun_keeps_its_number_of_steps(tmp_path, monkeypatch):
-    tiny = SHRUNKEN["npbg_tiny"]
-    monkeypatch.setattr(budgets, "steps_within", lambda seconds, config, dataset: round(seconds))
-    first = budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path)
-    assert (first.num_steps, first.seed, first.preset) == (120, 3, "npbg_tiny")
-    checkpoint.write_config(tmp_path, first)
-    monkeypatch.setattr(budgets, "steps_within", lambda *_: 7)
-    assert budgets.config_of(tiny, "tiny", 3, 2.0, None, tmp_path) == first
 
 
 def test_what_cannot_be_compared_is_refused_by_name():
