@@ -7,11 +7,11 @@
 
 What is there is kept, so the same command goes on where it was stopped.  It draws no random numbers.
 
-The truth are the points of the data set that a picture sees, also those that the network is not given.  Distances are
+The truth are the points of the data set that the eye sees, also those that the network is not given.  Distances are
 along the rays, in half diagonals of the object's box; a pixel is opaque where a method's opacity is above a half.
 
 error, median, bias   mean and median of |depth - truth|, and mean of depth - truth, at opaque pixels with such a point
-missed                percentage of the pixels with such a point that are not opaque
+missed                percentage of the reference's opaque pixels that are not opaque
 floaters              opaque pixels where the reference is empty, for each 1000 empty ones
 """
 
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from experiments import entry_point
 from experiments.comparison import results_folder, scores
@@ -47,6 +48,7 @@ COLUMNS = {  # head, decimals
     "missed": ("Missed, %", 2),
     "floaters": ("Floaters, per 1000", 2),
 }
+SPHERE = 10  # radius, in distances of the farthest point, of the sphere that tells which points the eye sees
 NOTE = (
     "Distances are along the rays, in half diagonals of the object's box. Means over objects with 95 % intervals. "
     "Errors at opaque pixels that see a point of the data set; floaters are opaque pixels where the reference is empty."
@@ -120,31 +122,37 @@ def score(item: ObjectData, pictures: Pictures) -> list[dict[str, float]]:
     depth, opaque = np.asarray(pictures.depth, np.float64), np.asarray(pictures.acc) > OPAQUE
     enlarged = np.asarray(scores.enlarge(pictures, item.images.shape[1:3]).acc) > OPAQUE
     found = []
-    for view, (camera, seen) in enumerate(zip(each_view(item), item.conditions[..., 3] > 0, strict=True)):
-        truth = true_depth(np.asarray(item.cloud.positions), camera, seen, depth.shape[1:])
-        known, empty = np.isfinite(truth), item.images[view, ..., 3] == 0
+    for view, camera in enumerate(each_view(item)):
+        truth = true_depth(np.asarray(item.cloud.positions), camera, depth.shape[1:])
+        known, alpha = np.isfinite(truth), item.images[view, ..., 3]
         off = (depth[view] - np.where(known, truth, 0))[known & opaque[view]]
         found.append(
             {
                 "error": mean(np.abs(off)),
                 "median": float(np.median(np.abs(off))) if off.size else np.nan,
                 "bias": mean(off),
-                "missed": 100 * mean(~opaque[view][known]),
-                "floaters": 1000 * mean(enlarged[view][empty]),
+                "missed": 100 * mean(~enlarged[view][alpha == 255]),
+                "floaters": 1000 * mean(enlarged[view][alpha == 0]),
             }
         )
     return found
 
 
-def true_depth(positions: np.ndarray, camera: Camera, seen: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Distance (*size) of the nearest point (n, 3) in each pixel, of those in `seen` pixels of the camera; else inf."""
-    pixels, _ = map(np.asarray, cameras.project(camera, jnp.asarray(positions)))
-    visible = seen[tuple(np.clip(np.floor(pixels).astype(int), 0, seen.shape[0] - 1).T[::-1])]
-    pixels, distance = map(np.asarray, cameras.project(cameras.resize(camera, *size), jnp.asarray(positions[visible])))
+def true_depth(positions: np.ndarray, camera: Camera, size: tuple[int, ...]) -> np.ndarray:
+    """Distance (*size) of the nearest point (n, 3) in each pixel, of those that the eye sees; inf without one."""
+    seen = positions[visible_points(positions - np.asarray(camera.cam_to_world)[:, 3])]
+    pixels, distance = map(np.asarray, cameras.project(cameras.resize(camera, *size), jnp.asarray(seen)))
     truth = np.full(size, np.inf)
     columns, rows = np.floor(pixels).astype(int).clip(0, size[0] - 1).T
     np.minimum.at(truth, (rows, columns), distance)
     return truth
+
+
+def visible_points(positions: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) an eye at 0 sees: those on the hull of their images in a sphere (Katz et al., 2007)."""
+    far = np.linalg.norm(positions, axis=1, keepdims=True)
+    hull = ConvexHull(np.concatenate([positions * (2 * SPHERE * far.max() / far - 1), np.zeros((1, 3))])).vertices
+    return hull[hull < len(positions)]
 
 
 def mean(values: np.ndarray) -> float:
