@@ -35,11 +35,10 @@ FUZZ ?=
 setup: .venv/complete
 
 .venv/complete: pyproject.toml constraints.txt
-	@begin=$$(date +%s); \
-	test -x $(PY) || $(PYTHON) -m venv .venv; \
+	@test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
 	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,data,viewer,formats,meshes,baselines,dev]' && \
-	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
+	touch $@
 
 demo: setup
 	$(PY) -m experiments.packaged.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)

@@ -14,9 +14,8 @@ again from the picture alone, by gradients through `spnr_jax.encode` and `spnr_j
 materials and points are those of the points that the picture shows.  One compiled step does it all: what differs is
 the start, and the rates of Adam.
 
-    OUT/results.json, table.md  errors before and after; gradients beside differences in float64
+    OUT/results.json, table.md  errors and losses; gradients beside differences in float64
     OUT/inverse.png             target, start and end
-    OUT/losses.png              mean squared error over the steps
 """
 
 import dataclasses
@@ -32,7 +31,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
-from matplotlib.figure import Figure
 
 import spnr_jax
 from experiments import entry_point
@@ -120,7 +118,7 @@ def main(options: InverseStudy) -> None:
         sheet += pictures[1 if sheet else 0 :]
     checks = compare_gradients(params, truths[:1] if options.quick else truths, tables, plan)
     rows = ["target", *(f"{task}, {when}" for task in RATES for when in ("start", "end"))]
-    files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size)), "losses.png": curves(found)}
+    files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size))}
     asked = {"points": truth.cloud.mask.shape[1], "size": size, "steps": steps, "plan": plan._asdict()}
     asked |= {"hardware": runtime.hardware(), "load": runtime.load()}
     note = f"{asked['points']} points, {size} px, {steps} steps; {asked['hardware']}, load {asked['load']}."
@@ -384,16 +382,6 @@ def make_tables(found: dict, checks: dict[str, list], names: list[str]) -> list[
         Table(title="Recovered from one picture", heads=heads, rows=tuple(rows)),
         Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),
     ]
-
-
-@figures.drawing
-def curves(found: Mapping[str, Any]) -> Figure:
-    """Mean squared errors: a panel for each task, a curve for each object."""
-    figure = Figure(figsize=(12, 2.6))
-    for axes, (task, of) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
-        axes.semilogy(np.array(of["losses"]))
-        axes.set(title=task, xlabel="step")
-    return figure
 
 
 if __name__ == "__main__":
