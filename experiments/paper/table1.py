@@ -3,7 +3,6 @@
     python -m experiments.paper.table1 --data DIR --out DIR [--budget quick|tiny|paper] [--methods ...]
 
     OUT/runs/METHOD/          the run folders of the networks
-    OUT/poisson_1024/         pictures of the reconstructions from so many points (.npz); OUT/poisson_trimmed_1024/
     OUT/results.json          everything below as numbers: scores, costs, settings, hardware, seed
     OUT/table.md              the tables
     OUT/gallery.png           pictures of unseen objects by every method
@@ -96,7 +95,7 @@ def main(options: Table1) -> None:
     data_sets.check_resolution(first, config)
     asked = {name: getattr(options, name) for name in ("budget", "seed")}
     results_folder.claim(options.out, "a table", asked, dataset)
-    surfaces, missing = surface_methods(options, dataset, config)  # before hours of training: something may be amiss
+    surfaces, missing = surface_methods(options, dataset)  # before hours of training: something may be amiss
     wanted = [name for name in NETWORKS if name in options.methods]
     trained = variants.train(
         [Variant(name=name, label=LABELS[name], config=configs[name], dataset=dataset) for name in wanted], options.out
@@ -112,7 +111,7 @@ def main(options: Table1) -> None:
         "radius_factors": {name: of.radius for name, of in floors.items() if of.radius is not None},
         "missing": missing,
         **variants.compare(scored, next((name for name in NETWORKS if name in trained), None)),
-        "costs": costs(options, trained, scored, config),
+        "costs": costs(trained, scored),
     }
     picture = variants.gallery({name: LABELS[name] for name in compared}, scored, ("psnr",))
     results_folder.write(options.out, found, make_tables(found), notes(found), {"gallery.png": picture})
@@ -136,16 +135,9 @@ def make_configs(options: Table1, size: int, category: str | None) -> dict[str, 
     return {name: dataclasses.replace(config, seed=options.seed) for name, config in found.items()}
 
 
-def surface_folder(options: Table1, config: TrainConfig, row: str) -> Path:
-    """Where the pictures of a Poisson row are kept."""
-    return options.out / f"{row}_{config.test_points}"
-
-
-def surface_methods(
-    options: Table1, dataset: data_sets.Dataset, config: TrainConfig
-) -> tuple[dict[str, Method], dict[str, str]]:
+def surface_methods(options: Table1, dataset: data_sets.Dataset) -> tuple[dict[str, Method], dict[str, str]]:
     """The Poisson rows in the data set's light, and those that have to be left out, with the reason."""
-    wanted = {name: surface for name, surface in poisson.SURFACES.items() if name in options.methods}
+    wanted = [name for name in poisson.SURFACES if name in options.methods]
     if not wanted:
         return {}, {}
     try:
@@ -155,18 +147,13 @@ def surface_methods(
         print(f"Poisson not run: {error}", flush=True)
         return {}, dict.fromkeys(wanted, f"not run: {error}; pip install 'spnr-jax[data,baselines]'")
     renderer = poisson.Renderer(dataset.settings, options.envmap, options.variant, options.seed)
-    return {
-        name: poisson.keep_pictures(renderer, surface, surface_folder(options, config, name))
-        for name, surface in wanted.items()
-    }, {}
+    return {name: renderer.method(name) for name in wanted}, {}
 
 
-def costs(options: Table1, trained: dict[str, Trained], scored: Scored, config: TrainConfig) -> dict[str, dict]:
+def costs(trained: dict[str, Trained], scored: Scored) -> dict[str, dict]:
     """What each method took; milliseconds per view are the median over all objects but the first, which compiled."""
     table: dict[str, dict] = {}
     for method, seconds in scored.seconds.items():
-        if method in poisson.SURFACES:  # the pictures may have been there already
-            seconds = poisson.seconds_per_view(surface_folder(options, config, method), scored.scores)
         warm = seconds[1:]
         cost = trained[method].cost if method in trained else {}
         table[method] = cost | {"ms_per_view": round(1000 * statistics.median(warm), 2) if warm else None}

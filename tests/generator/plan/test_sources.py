@@ -126,9 +126,7 @@ f  1/1/1 2/2/1 4/4/1
 """
 MTL = """newmtl material_0_24
 Kd 0.8 0.8 0.8
-Ka 0 0 0
 Ks 0.4 0.4 0.4
-Ke 0 0 0
 Ns 10
 illum 2
 map_Kd {image}

@@ -11,7 +11,7 @@ from data_gen.store.check import object_faults
 
 ITEM = tiny_dataset.one_object()
 SETTINGS = {"views": tiny_dataset.VIEWS, "resolution": tiny_dataset.SIZE, "points": tiny_dataset.POINTS}
-WHOLE = {"files": {}, "product": "lamp", "variant": 0}
+WHOLE = {"files": {}}
 LIGHTS = np.ones((tiny_dataset.VIEWS, 32, 64, 3), np.float32)
 DARK = LIGHTS * np.array([1, 0, 1], np.float32)[:, None, None, None]
 
@@ -25,7 +25,7 @@ def moved(**changes):
     ("item", "details", "expected"),
     [
         (ITEM, WHOLE, None),
-        (ITEM, WHOLE | {"files": None}, "object.json: expected files, product and variant"),
+        (ITEM, {}, "object.json: expected the checksums"),
         (ITEM, WHOLE | {"files": {"points.ply": "0"}}, "points.ply has another checksum"),
         (replace(ITEM, images=ITEM.images[:2]), WHOLE, r"expected \(views, resolution\) \(3, 24\), got \(2, 24\)"),
         (ITEM, WHOLE | {"files": {"lights.npz": None}}, "lights.npz is there"),
