@@ -2,7 +2,7 @@
 #   make demo                generate, train, evaluate, report: runs/demo/report.html
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
 #   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
-#   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--minutes 10'   on your data, with more options
+#   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--shown 20'    on your data, with more options
 #   make bench               time the network beside a PyTorch twin: runs/bench/table.md (BENCH="--quick")
 #   make test                the everyday suite
 #   make test-ci             what takes minutes more: experiments, wheel, notebooks, kills, many devices
@@ -35,11 +35,10 @@ FUZZ ?=
 setup: .venv/complete
 
 .venv/complete: pyproject.toml constraints.txt
-	@begin=$$(date +%s); \
-	test -x $(PY) || $(PYTHON) -m venv .venv; \
+	@test -x $(PY) || $(PYTHON) -m venv .venv; \
 	echo "installing into .venv (about a minute)"; \
 	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,data,viewer,formats,meshes,baselines,dev]' && \
-	echo $$(( $$(date +%s) - begin )) > .venv/install_seconds && touch $@
+	touch $@
 
 demo: setup
 	$(PY) -m experiments.packaged.demo --out $(OUT) $(if $(MESHES),--meshes $(MESHES)) $(if $(TEST_LIST),--test-list $(TEST_LIST)) $(DEMO)

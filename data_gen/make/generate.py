@@ -1,6 +1,6 @@
 """A data set from its plan: what is missing is made by workers (devices/runtime.py), then the lists are written.
 
-Products are made first, split, and then the colour variants of those that train (plan/splits.py). A run may stop
+Products are made first, split, and then the colour variants of those that train (plan/tasks.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
 comes first and holds the folder for these settings; rejected.jsonl and the splits come last. Runs on several machines
 may share a data set: each skips what another has finished meanwhile, and equal settings write equal bytes.
@@ -30,7 +30,7 @@ from spnr_jax.formats.images import read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead
-PLACES = ("out", "workers", "root", "meshes", "objects", "envmap", "lights", "test_list", "split_file")
+PLACES = ("out", "workers", "root", "meshes", "objects", "envmap", "lights", "test_list")
 
 
 def describe(plan: Plan, variant: str) -> dict:
@@ -41,7 +41,6 @@ def describe(plan: Plan, variant: str) -> dict:
         if settings[name] == first:  # as data sets have it that were described before there was the choice
             del settings[name]
     mesh_ids = [task.object_id for task in plan.tasks if task.path]
-    listed = {split: {"count": len(ids), "ids_sha256": text_checksum(ids)} for split, ids in plan.listed.items()}
     return {
         "schema_version": layout.SCHEMA_VERSION,
         "settings": {
@@ -51,8 +50,8 @@ def describe(plan: Plan, variant: str) -> dict:
             "category": category,
             "visibility": "face",
             "objects": len(plan.tasks) - len(mesh_ids),
-            "mesh_files": {"count": len(mesh_ids), "ids_sha256": text_checksum(mesh_ids)},
-            "listed_splits": listed,
+            "mesh_files": describe_ids(mesh_ids),
+            "listed_splits": {} if plan.listed is None else {"test": describe_ids(plan.listed)},
             "variant": variant,
         },
         "environment_map": describe_light(config),
@@ -77,9 +76,9 @@ def describe_kind(name: str) -> dict:
     return {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
 
 
-def text_checksum(lines: Sequence[str]) -> str:
-    """The SHA-256 of lines of text."""
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+def describe_ids(ids: Sequence[str]) -> dict:
+    """A list of objects: how many, and the SHA-256 of its lines."""
+    return {"count": len(ids), "ids_sha256": hashlib.sha256("\n".join(ids).encode()).hexdigest()}
 
 
 def differences(before: dict, after: dict) -> list[str]:

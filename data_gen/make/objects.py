@@ -1,14 +1,11 @@
-"""One object from its source to its folder, as a worker process makes it; and its mesh, made again from its record.
+"""One object from its source to its folder, as a worker process makes it.
 
 Everything random about an object follows from (seed, object id) alone, so neither the order, nor the number of workers,
-nor an interruption changes a byte.  A procedural object can so be made again; a mesh file has to be there again, under
-the folder that the data set was made from (`root`).  The points that the data set holds are drawn from the mesh
-once more and compared: a file or generator that changed is refused, since its depths would be of something else.
+nor an interruption changes a byte.
 """
 
 import hashlib
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -19,10 +16,8 @@ from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.render.variant import mitsuba_module
 from data_gen.store import layout
-from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes, surface_points
 from spnr_jax.formats.assets import Asset, Material, RejectedAsset
-from spnr_jax.formats.surface_points import Spread, sample_surface
 from spnr_jax.surfels.lighting import HEIGHT, resample
 
 
@@ -124,47 +119,3 @@ def describe_material(material: Material) -> dict:
         size = {"texture": list(channel.shape[:2])}
         described[name] = channel.astype(float).tolist() if channel.ndim == value_rank else size
     return described
-
-
-MOVED = 1e-4  # of the object's half diagonal; the same mesh gives the same points but for a last bit
-
-
-def original(
-    details: dict, seed: int, stored: np.ndarray, root: Path | None = None, spread: Spread = "random"
-) -> Asset:
-    """The normalised object of an object.json and the seed of its data set, checked against its points (n, 3).
-
-    ValueError, with what to do, where it cannot be had.
-    """
-    task = task_of(details, root)
-    if task.path and not task.path.is_file():
-        raise UserError(f"{task.path}: the mesh of object {task.object_id} is not there; give its folder with --meshes")
-    try:
-        asset = make_asset(task, seed)[0]
-        again = sample_surface(asset, len(stored), details["seeds"]["points"], spread).positions
-    except RejectedAsset as error:
-        raise UserError(f"{task.shown_path or task.object_id}: cannot be made again ({error})") from None
-    moved = float(np.abs(again - stored).max(initial=0))
-    if not moved < MOVED:
-        raise UserError(
-            f"object {task.object_id}: its points do not lie on the mesh that is made now (off by up to {moved:.3g}): "
-            "the mesh file or the generator has changed; generate the data set again"
-        )
-    return asset
-
-
-def task_of(details: dict, root: Path | None) -> Task:
-    """What made the object: a category, or a mesh file under the root."""
-    name, source = details["id"], details["source"]
-    variant = details.get("variant", 0)  # data sets from before there were colour variants do not say
-    made = {
-        "object_id": name,
-        "variant_of": details["product"] if variant else "",
-        "colour_variant": variant,
-        "reshaped": "reshaping" in details,
-    }
-    if "file" not in source:
-        return Task(category=details["category"], **made)
-    if root is None:
-        raise UserError(f"object {name} was made from {source['file']}: give the folder of the meshes with --meshes")
-    return Task(path=root / source["file"], folder=root, shown_path=source["file"], **made)

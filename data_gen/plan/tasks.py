@@ -2,10 +2,15 @@
 
 A procedural object is `category_000012`, its number counted through all categories; a mesh's id comes from its file, or
 from the data set that it is part of (`sources`). A colour variant of a product is `ID--1`, `ID--2`, ...: it lies
-beside its product in every sorted list. Which products train, and so have variants, is decided in splits.py,
-when it is known which can be rendered at all.
+beside its product in every sorted list.
+
+Products (objects as their source holds them) are split, never variants: a colour variant is made of a training product
+only and is in the training split with it. Products are ranked by a hash of (seed, id); the first are the test split,
+or those of a test list, the next the validation split, the rest train. Only usable products are ranked: what cannot be
+rendered is in no split and takes nobody's place.
 """
 
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +22,7 @@ from typing import Literal
 import tyro
 
 from data_gen import procedural
-from data_gen.plan import sources, splits
+from data_gen.plan import sources
 from data_gen.plan.sources import Category
 from spnr_jax.errors import UserError, at_least
 from spnr_jax.formats import meshes
@@ -57,9 +62,6 @@ class GenerateConfig:
     """Objects of the test split, drawn by the seed (default: the share --test-fraction)."""
     test_list: Path | None = None
     """Text file with the ids, one per line, of the objects that go to the test split."""
-    split_file: Path | None = None
-    """Splits: .json {"train": [ids], "val": [ids], "test": [ids]}, or .csv with columns id,split or as in ShapeNet's
-    all.csv. Objects that it does not list are left aside; they train if it lists no training objects."""
     resolution: int = 64
     """Width and height of the images in pixels."""
     views: int = 10
@@ -120,28 +122,37 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The products of a data set, the splits that a file names, and how many products the others are to hold."""
+    """The products of a data set, the test split that a file names, and how many products the others are to hold."""
 
     config: GenerateConfig
     tasks: tuple[Task, ...]
-    listed: splits.Listed
+    listed: tuple[str, ...] | None
     num_test: int
     num_val: int
 
     def split(self, usable: Sequence[str]) -> dict[str, list[str]]:
         """The sorted ids of each split of the products that can be rendered."""
-        return splits.split_products(usable, self.listed, self.config.seed, self.num_test, self.num_val)
+        order = rank(usable, self.config.seed, "split")
+        test = set(usable) & set(order[: self.num_test] if self.listed is None else self.listed)
+        rest = [name for name in order if name not in test]
+        val, train = rest[: self.num_val], rest[self.num_val :]
+        return {"train": sorted(train), "val": sorted(val), "test": sorted(test)}
 
     def variants(self, train_ids: Sequence[str]) -> list[Task]:
-        """The colour variants of the training products, sorted by id."""
-        products = {task.object_id: task for task in self.tasks}
-        total = self.config.train_objects
-        most = None if total is None else max(total - len(train_ids), 0)
-        reshaped = self.config.reshape_variants
+        """The colour variants of the training products, sorted by id; where there are too many, they are drawn."""
+        config, products = self.config, {task.object_id: task for task in self.tasks}
+        most = None if config.train_objects is None else max(config.train_objects - len(train_ids), 0)
+        names = {f"{name}/{k}": (name, k) for name in train_ids for k in range(1, config.colour_variants + 1)}
+        reshaped = config.reshape_variants
         return [
             replace(products[name], object_id=f"{name}--{k}", variant_of=name, colour_variant=k, reshaped=reshaped)
-            for name, k in splits.chosen_variants(train_ids, self.config.colour_variants, most, self.config.seed)
+            for name, k in sorted(names[name] for name in rank(list(names), config.seed, "variants")[:most])
         ]
+
+
+def rank(ids: Sequence[str], seed: int, purpose: str) -> list[str]:
+    """The ids in an order that depends on nothing but (purpose, seed, id)."""
+    return sorted(ids, key=lambda name: hashlib.sha256(f"{purpose}/{seed}/{name}".encode()).digest())
 
 
 def check_options(config: GenerateConfig) -> None:
@@ -173,8 +184,6 @@ def check_source(config: GenerateConfig) -> None:
         raise UserError(f"--root {config.root}: only with --preset; --meshes takes a folder of mesh files")
     if config.preset and not config.root:
         raise UserError(f"--preset {config.preset}: give --root, the folder that holds its meshes")
-    if config.split_file and config.test_list:
-        raise UserError(f"--test-list {config.test_list}: not together with --split-file; give one of them")
 
 
 def source_of(config: GenerateConfig) -> tuple[Source, Category | None]:
@@ -229,30 +238,29 @@ def show_path(path: Path, root: Path) -> str:
 def plan_data_set(config: GenerateConfig) -> Plan:
     """The products to render and the sizes of the splits; ValueError if the options do not fit the objects."""
     tasks = plan_objects(config)
-    listed = read_listed(config, {task.object_id for task in tasks})
-    named = {name for ids in listed.values() for name in ids}
-    tasks = [task for task in tasks if task.object_id in named or "train" not in listed]
-    num_free = len(tasks) - len(listed.get("test", ()))
+    listed = read_test_list(config.test_list, {task.object_id for task in tasks}) if config.test_list else None
+    num_free = len(tasks) - len(listed or ())
     num_test = round(config.test_fraction * len(tasks)) if config.test_objects is None else config.test_objects
-    if not listed and num_test >= len(tasks):
+    if listed is None and num_test >= len(tasks):
         raise UserError(f"--test-objects {num_test}: leaves none of the {len(tasks)} objects to train on")
     num_val = round(config.val_fraction * num_free)
     plan = Plan(config=config, tasks=tuple(tasks), listed=listed, num_test=num_test, num_val=num_val)
     if config.train_objects is None:
         return plan
     split_ids = plan.split([task.object_id for task in tasks])
-    surplus = set(splits.rank(split_ids["train"], config.seed, "split")[config.train_objects :])
+    surplus = set(rank(split_ids["train"], config.seed, "split")[config.train_objects :])
     return replace(plan, tasks=tuple(task for task in tasks if task.object_id not in surplus))
 
 
-def read_listed(config: GenerateConfig, known: set[str]) -> splits.Listed:
-    """The ids of the splits that the user's file names, none without a file."""
-    if config.test_list:
-        return splits.read_test_list(config.test_list, known)
-    if not config.split_file:
-        return {}
-    category = source_of(config)[1]
-    return splits.read_split_file(config.split_file, known, sources.SYNSETS[category] if category else None)
+def read_test_list(path: Path, known: set[str]) -> tuple[str, ...]:
+    """The sorted ids of a text file with one id per line; ValueError if it names an object that is not there."""
+    try:
+        ids = sorted(set(path.read_text().split()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--test-list {path}: not a readable text file ({error})") from None
+    if unknown := [name for name in ids if name not in known]:
+        raise UserError(f"--test-list {path}: no object {unknown[0]} ({len(unknown)} of {len(ids)} ids unknown)")
+    return tuple(ids)
 
 
 # --- the paper's data sets --------------------------------------------------------------------------------------------

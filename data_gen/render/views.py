@@ -10,14 +10,10 @@ their part, (vertices,), as a reconstructed surface has them; base colours of ve
 
 Which points a picture sees is the paper's rule: all points on a face that any primary ray of the camera hits; a point
 on such a face counts even where another part hides it.
-
-True depth (`caster`) is how far rays go until they meet the mesh. Distances are along the rays, whose directions
-have unit length (not the camera's z), in the units of the asset: those of a normalised object are the units of
-`spnr_jax.kernels.records.Rendering.depth`. Faces are met from both sides.
 """
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -270,24 +266,3 @@ def render_views(
         conditions.append(condition_image(image, project(pose, surface.positions[seen].astype(np.float64), config)))
         scene = next(scenes, scene)
     return np.stack(images), np.stack(conditions)
-
-
-NO_LIGHT = np.zeros((4, 8, 3), np.float32)
-
-Caster = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def caster(asset: Asset) -> Caster:
-    """A function of origins and unit directions (rays, 3): distances (rays,) float32, inf where a ray misses."""
-    mi, scene = mitsuba_module(), build_scene(asset, NO_LIGHT).handle
-
-    def cast(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        if mi.variant().startswith("scalar"):
-            rays = (mi.Ray3f(o=o, d=d, time=0, wavelengths=[]) for o, d in zip(origins, directions, strict=True))
-            found = [scene.ray_intersect_preliminary(ray).t for ray in rays]
-        else:
-            o, d = (np.asarray(x, np.float32).T for x in (origins, directions))
-            found = scene.ray_intersect_preliminary(mi.Ray3f(o=o, d=d, time=0, wavelengths=[])).t
-        return np.array(found, np.float32)
-
-    return cast

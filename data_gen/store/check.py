@@ -28,11 +28,10 @@ def check(dataset: Path) -> bool:
     splits, faults = read_splits(dataset)
     faults += split_faults(splits, set(object_ids)) if not faults else []
     agreements, covered, num_views = [], [], 0
-    details: dict[str, dict] = {}
     for object_id in object_ids:
         try:
-            item, details[object_id] = data_sets.read_object(data, object_id), read_details(dataset, object_id)
-            found = object_faults(data, item, details[object_id])
+            item = data_sets.read_object(data, object_id)
+            found = object_faults(data, item, read_details(dataset, object_id))
         except (ValueError, OSError) as error:
             faults.append(f"{object_id}: {type(error).__name__}: {error}")
             continue
@@ -43,7 +42,6 @@ def check(dataset: Path) -> bool:
         agreements.append(agreement)
         covered.append((item.images[..., 3] > 0).mean())
         num_views += len(item.images)
-    faults += variant_faults(splits, details)
     print_table(dataset, object_ids, splits, num_views, agreements, covered, faults)
     return not faults
 
@@ -101,29 +99,11 @@ def split_faults(splits: Mapping[str, list[str]], object_ids: set[str]) -> list[
     return faults
 
 
-def variant_faults(splits: Mapping[str, list[str]], details: dict[str, dict]) -> list[str]:
-    """What is wrong with colour variants: all of a product are in one split, and only train has any."""
-    split_of = {object_id: split for split, ids in splits.items() for object_id in ids}
-    faults: list[str] = []
-    of_product: dict[str, set[str]] = {}
-    for object_id, detail in details.items():
-        split = split_of.get(object_id)
-        if split is None:
-            continue
-        of_product.setdefault(str(detail.get("product")), set()).add(split)
-        if detail.get("variant") and split != "train":
-            faults.append(f"splits: {object_id} is a colour variant, but in {split}; only training objects have any")
-    for product, found in sorted(of_product.items()):
-        if len(found) > 1:
-            faults.append(f"splits: variants of {product} are in {' and '.join(sorted(found))}")
-    return faults
-
-
 def object_faults(data: Dataset, item: ObjectData, details: dict) -> list[str]:
     """What is wrong with one object."""
-    files, settings = details.get("files", {}), data.settings["settings"]
-    if not isinstance(files, dict) or not {"product", "variant"} <= details.keys():
-        return ["object.json: expected files, product and variant"]
+    files, settings = details.get("files"), data.settings["settings"]
+    if not isinstance(files, dict):
+        return ["object.json: expected the checksums of its files"]
     folder = data.folder / "objects" / item.name
     damaged = [name for name, checksum in files.items() if checksum_of(folder / name) != checksum]
     faults = [f"{name} has another checksum than when it was written" for name in damaged]

@@ -1,45 +1,15 @@
-"""Figures of one style, and pictures side by side as one picture, with names above the columns and beside the rows."""
+"""Pictures side by side as one picture, with names above the columns and beside the rows."""
 
-import functools
-import io
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from spnr_jax.formats.images import to_uint8
 
-COLORS = ("#2457d6", "#d9480f", "#2f9e44", "#9c36b5", "#0b7285", "#e8a700", "#868e96", "#495057", "#adb5bd")
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.25,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "figure.constrained_layout.use": True,
-}
 INK, PAPER, GAP = (29, 35, 48), (255, 255, 255), 4
 FONT_SIZE, LETTER = 12, 6.2  # pixels, the second the mean width of a letter
-
-
-def drawing(draw: Callable[..., Figure]) -> Callable[..., bytes]:
-    """The PNG of the figure that a function draws, in the style of all figures."""
-
-    @functools.wraps(draw)
-    def call(*arguments: Any, **options: Any) -> bytes:
-        stream = io.BytesIO()
-        with rc_context(STYLE):
-            draw(*arguments, **options).savefig(stream, format="png", dpi=110, metadata={"Software": None})
-        return stream.getvalue()
-
-    return call
 
 
 def grid(

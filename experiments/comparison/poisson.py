@@ -4,16 +4,13 @@
 
 Light, cameras, samples per pixel and integrator are those that dataset.json names.  An object whose points span no
 surface is an empty picture.  The solver closes what is open, bridges what is near, and extrapolates; `trim` removes its
-least supported vertices.  It runs in one thread: equal points, equal surface.  `keep_pictures` keeps pictures by
-object, as FOLDER/NAME.npz.
+least supported vertices.  It runs in one thread: equal points, equal surface.
 """
 
 import dataclasses
 import hashlib
 import importlib
 import sys
-import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,14 +20,12 @@ from scipy.spatial import cKDTree
 from data_gen.render import light, views
 from data_gen.render.variant import choose_variant, mitsuba_module
 from experiments.comparison.contenders import Method, of_rgba
-from experiments.comparison.results_folder import load_or_make
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.assets import Asset, Material, Part
 from spnr_jax.formats.images import read_envmap
 from spnr_jax.formats.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels.normals import outward_normals
 from spnr_jax.surfels.skies import indoor_envmap
 
@@ -165,22 +160,3 @@ def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     if hashlib.sha256(envmap.read_bytes()).hexdigest() != described["sha256"]:
         raise UserError(f"--envmap {envmap}: not the {described['name']} that lit the data set (another checksum)")
     return radiance
-
-
-def keep_pictures(renderer: Renderer, surface: Surface, folder: Path) -> Method:
-    """The surface as a method whose pictures and seconds a view are kept by object: made once, then read."""
-
-    def make(item: data_sets.ObjectData) -> tuple[np.ndarray, np.ndarray]:
-        start = time.monotonic()
-        pictures = renderer.draw(reconstruct(item.cloud, surface), item)
-        return pictures, np.array((time.monotonic() - start) / len(pictures))
-
-    def draw(_: None, item: data_sets.ObjectData) -> Pictures:
-        return of_rgba(load_or_make(folder / f"{item.name}.npz", lambda: make(item))[0])
-
-    return Method(draw=draw)
-
-
-def seconds_per_view(folder: Path, names: Iterable[str]) -> list[float]:
-    """Seconds of solver and renderer by object, shared by its views."""
-    return [float(np.load(folder / f"{name}.npz")["1"]) for name in names]

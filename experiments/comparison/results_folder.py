@@ -17,7 +17,6 @@ from PIL import Image
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
-from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.scoring.report import Cell, Table
 from spnr_jax.training import trainer
 
@@ -40,15 +39,10 @@ def as_json(content: object) -> bytes:
 
 
 def load_or_make(place: Path, make: Callable[[], Any]) -> Any:
-    """What a file holds: JSON, arrays (.npz) or a picture (.png); it is made if it is not there."""
+    """What a file holds: JSON or a picture (.png); it is made if it is not there."""
     if not place.is_file():
         images.write_whole(place, WRITERS[place.suffix](make()))
     return READERS[place.suffix](place)
-
-
-def _arrays(place: Path) -> tuple[np.ndarray, ...]:
-    with np.load(place, allow_pickle=False) as arrays:
-        return tuple(arrays[name] for name in arrays.files)
 
 
 def _picture(place: Path) -> np.ndarray:
@@ -58,12 +52,10 @@ def _picture(place: Path) -> np.ndarray:
 
 WRITERS: dict[str, Callable[[Any], bytes]] = {
     ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
-    ".npz": lambda arrays: pack_arrays({str(number): array for number, array in enumerate(arrays)}, compressed=True),
     ".png": images.png,
 }
 READERS: dict[str, Callable[[Path], Any]] = {
     ".json": lambda place: json.loads(place.read_text()),
-    ".npz": _arrays,
     ".png": _picture,
 }
 

@@ -8,7 +8,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.picture_scores import Scores, flip, sharpness
-from spnr_jax.scoring.report import Cell, duration, mean_row
+from spnr_jax.scoring.report import Cell, mean_row
 
 Measured = tuple[dict[str, Any], np.ndarray]  # what is measured of an object, and its first picture
 Measure = Callable[[ObjectData], Measured]
@@ -44,7 +44,6 @@ COLUMNS = {  # scores of a view: heads, decimals
     "flip": ("FLIP", 4),
     "iou": ("opacity IoU", 3),
 }
-PROGRESS_LINES = 20
 OPAQUE = 0.5  # opacity of the reference from which a pixel lies inside the silhouette
 
 
@@ -119,12 +118,6 @@ def over_white(reference: np.ndarray) -> np.ndarray:
     return reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
 
 
-def mean_of(item: ObjectData, pictures: Pictures, columns: Iterable[str]) -> dict[str, Any]:
-    """Means over the views of some of the scores."""
-    found = score_views(item, pictures)
-    return mean_scores({name: found[name] for name in columns})
-
-
 def mean_scores(scores: Mapping[str, Sequence[float]]) -> dict[str, float | None]:
     """The mean of each score over the views that have one."""
     found = {}
@@ -166,13 +159,12 @@ def reference(dataset: Dataset, name: str, resolution: int | None = None) -> np.
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """One view of one object: reference and the picture of each method (height, width, 3), with its PSNR."""
+    """One view of one object: reference and the picture of each method (height, width, 3)."""
 
     name: str
     view: int
     reference: np.ndarray
     images: dict[str, np.ndarray]
-    psnr: dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,13 +184,13 @@ def score_objects(
     num_shown: int,
     more: Callable[[ObjectData, Pictures], Scores] | None = None,
 ) -> Scored:
-    """All methods on these objects, with a line now and then; points and image size are the config's.
+    """All methods on these objects; points and image size are the config's.
 
     `more` scores a method's pictures of an object in other ways, too.
     """
     seconds: dict[str, list[float]] = {method: [] for method in methods}
-    scores, shown, to_show, start = {}, [], evaluation.spread(names, num_shown), time.monotonic()
-    for number, name in enumerate(names, start=1):
+    scores, shown, to_show = {}, [], evaluation.spread(names, num_shown)
+    for name in tqdm(names, desc="scoring"):
         item = data_sets.read_object(dataset, name)
         item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))
         shows = {label: time_views(method, item, seconds[label]) for label, method in methods.items()}
@@ -211,9 +203,6 @@ def score_objects(
         scores[name] = result.scores
         if name in to_show:
             shown.append(shown_view(result))
-        if number % max(1, len(names) // PROGRESS_LINES) == 0 or number == len(names):
-            left = duration((time.monotonic() - start) / number * (len(names) - number))
-            print(f"scored {number} of {len(names)} objects, about {left} left", flush=True)
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
@@ -237,5 +226,4 @@ def shown_view(result: evaluation.ObjectResult) -> Shown:
         view=view,
         reference=result.reference[view],
         images={method: np.asarray(pictures.image[view]) for method, pictures in result.pictures.items()},
-        psnr={method: float(scores["psnr"][view]) for method, scores in result.scores.items()},
     )

@@ -1,18 +1,13 @@
-"""An object of a data set as a study asks for it: so many points and views, at a resolution; and its mesh."""
+"""An object of a data set as a study asks for it: so many points and views, at a resolution."""
 
 import dataclasses
-import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_gen.make import objects
-from data_gen.render import views
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.assets import Asset
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels import cameras
@@ -67,22 +62,3 @@ def shrink(rgba: np.ndarray, side: int) -> np.ndarray:
 def each_view(item: ObjectData) -> list[Camera]:
     """The cameras of an object, one by one."""
     return [jax.tree.map(lambda x, view=view: x[view], item.camera) for view in range(len(item.images))]
-
-
-def mesh_of(dataset: Dataset, item: ObjectData, meshes: Path | None) -> Asset:
-    """The normalised mesh of an object; ValueError if it cannot be made again, or is another one by now.
-
-    `meshes` is the folder of the mesh files, where the data set was made from such.
-    """
-    seed = dataset.settings.get("settings", {}).get("seed")
-    if seed is None:
-        raise UserError(f"{dataset.folder / 'dataset.json'}: names no seed, so its meshes cannot be made again")
-    positions = np.asarray(item.cloud.positions)
-    details = json.loads((dataset.folder / "objects" / item.name / "object.json").read_bytes())
-    return objects.original(details, seed, positions, meshes, dataset.spread)
-
-
-def cast_views(cast: views.Caster, camera: Camera) -> np.ndarray:
-    """Distances (views, h, w) along the camera's rays, inf where they miss."""
-    rays = jax.tree.map(np.asarray, cameras.camera_rays(camera))
-    return cast(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)).reshape(rays.origins.shape[:3])

@@ -1,10 +1,11 @@
-"""Variants of one training, each in its run folder, scored on the same unseen objects, points and cameras.
+"""Networks trained one after another, each in its run folder, and compared on the same unseen objects and cameras.
 
-    OUT/runs/VARIANT/        the run folders; a stopped run goes on, a finished one is only read
+    OUT/runs/NAME/           the run folders; a stopped run goes on, a finished one is only read
     OUT/asked.json           whose folder it is: another data set, preset, seed or number of steps is refused
     OUT/results.json  OUT/table.md  OUT/gallery.png
 
-Differences are taken to one variant, the reference, view by view; intervals are bootstraps over objects.
+Differences are those of one network, the reference, to each other method, view by view; intervals are bootstraps over
+objects.
 """
 
 import dataclasses
@@ -16,11 +17,9 @@ from typing import Literal
 import jax
 import numpy as np
 
-from experiments.comparison import budget as budgets
 from experiments.comparison import figures, results_folder
-from experiments.comparison.budget import Trained
 from experiments.comparison.contenders import of_network
-from experiments.comparison.scores import OPAQUE, Scored, score_objects
+from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
@@ -29,19 +28,14 @@ from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.picture_scores import Scores, difference, means, metric_settings
-from spnr_jax.scoring.report import ARROWS, HIGHER, QUALITY, Cell, Table, number, text
-from spnr_jax.training import checkpoint, optimisation
+from spnr_jax.scoring.picture_scores import Scores, differences, means, metric_settings, summarise
+from spnr_jax.scoring.report import Cell, Table, difference, head, number, quality
+from spnr_jax.training import checkpoint, optimisation, trainer
 
 Preset = Literal["abo", "shapenet_car", "shapenet_plane", "shapenet_chair", "small", "tiny"]
 QUICK_STEPS, QUICK_OBJECTS = 4, 2
-METRICS = {  # head, decimals, what is better
-    "psnr": QUALITY["psnr"],
-    "inside": ("PSNR inside, dB", 2, HIGHER),
-    **{name: QUALITY[name] for name in ("ssim", "flip", "iou")},
-    "detail": ("HF energy", 2, 0),
-}
-HEADS = tuple(f"{head} {ARROWS[better]}" if better else head for head, _, better in METRICS.values())
+SAVES = 40  # checkpoints and previews of a long run
+METRICS = ("psnr", "ssim", "flip", "iou")  # of a study
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +82,15 @@ class Variant:
     start: Callable[[TrainConfig], optimisation.TrainState] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """A trained network, ready to be shown: and what it cost."""
+
+    config: TrainConfig
+    variables: dict
+    cost: dict[str, str | int | float | None]
+
+
 def study(
     out: Path,
     what: str,
@@ -95,7 +98,6 @@ def study(
     reference: str,
     budget: Budget,
     dataset: data_sets.Dataset,
-    more: Mapping[str, object] | None = None,
     **asked: object,
 ) -> None:
     """Trains what is not trained in a folder that is this experiment's, scores all variants, writes the files."""
@@ -107,13 +109,41 @@ def study(
     trained = train(variants, out)
     order = sorted(trained, key=lambda name: name != reference)  # the first chooses the view of an object that is shown
     methods = {name: of_network(trained[name].config, trained[name].variables) for name in order}
-    scored = score_objects(methods, config, dataset, names, budget.shown, more_scores)
-    found = numbers(variants, reference, scored, budget, dataset) | dict(more or {})
-    tables = [quality_table(found)]
+    scored = score_objects(methods, config, dataset, names, budget.shown, measure_detail)
+    found = asked | conditions(dataset, names, config) | compare(scored, reference)
+    labels, more = {one.name: one.label for one in variants}, {}
+    for variant in variants:
+        detail = means([of[variant.name] for of in scored.scores.values()], ("detail",))
+        found["methods"][variant.name] |= {"training_objects": len(variant.dataset.splits["train"]), **detail}
+        more[variant.name] = (number(detail["detail"], 2, detail["detail_interval"]),)
+    tables = [methods_table(found, labels, METRICS, ("HF energy",), more)]
     if len(variants) > 1:
-        tables.append(differences_table(found))
-    picture = gallery({one.name: one.label for one in variants}, scored, ("psnr", "detail"))
+        tables.append(differences_table(found, labels, METRICS))
+    picture = gallery(labels, scored, ("psnr", "detail"))
     results_folder.write(out, found, tables, notes(found), {"gallery.png": picture})
+
+
+def measure_detail(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
+    """High-frequency energy over the reference's, by view."""
+    ratio = jax.jit(metrics.high_frequency_ratio)
+    return {"detail": np.asarray(ratio(np.asarray(pictures.image), data_sets.on_white(item.images)))}
+
+
+def notes(found: Mapping) -> list[str]:
+    """What a reader has to know of the numbers of a study."""
+    counts = sorted({row["training_objects"] for row in found["methods"].values()})
+    return [
+        f"Budget: preset {found['preset']}, {found['steps']:,} steps each, {' or '.join(map(str, counts))} training "
+        f"objects. Seed {found['seed']}.",
+        f"Hardware: {found['hardware']}.",
+        f"Every variant: the same test objects, cameras and first {found['points']} points; {found['resolution']} px.",
+        "HF energy: above half of the Nyquist frequency in a Hann window, over the reference's; 1 is equally sharp, "
+        "less is smoother, more is noise or a sharpness that is not there.",
+        *(f"{name}: {text}." for name, text in found["metrics"].items() if name != "LPIPS"),
+    ]
+
+
+# --- trainings --------------------------------------------------------------------------------------------------------
 
 
 def train(variants: Sequence[Variant], out: Path) -> dict[str, Trained]:
@@ -121,120 +151,90 @@ def train(variants: Sequence[Variant], out: Path) -> dict[str, Trained]:
     found: dict[str, Trained] = {}
     for place, variant in enumerate(variants, start=1):
         run, config = out / "runs" / variant.name, variant.config
-        print(f"run {place} of {len(variants)}: {variant.label}, {config.num_steps} steps in {run}", flush=True)
+        about = f"{variant.label}, preset {config.preset}, {config.num_steps} steps"
+        print(f"run {place} of {len(variants)}: {about} in {run}", flush=True)
         if variant.start and not (run / "checkpoints").is_dir():
             state = variant.start(config)
             checkpoint.write_config(run, config)
             checkpoint.save(run, state)
-        found[variant.name] = budgets.train(config, variant.dataset, run)
+        found[variant.name] = train_one(config, variant.dataset, run)
     return found
 
 
-def without_colour_variants(dataset: data_sets.Dataset) -> data_sets.Dataset:
-    """The data set whose training objects have no colour variants."""
-    train = tuple(name for name in dataset.splits["train"] if name == original(name))
-    return dataclasses.replace(dataset, splits=dataset.splits | {"train": train})
-
-
-def original(name: str) -> str:
-    """The object that a variant was made of (these are called ID--1, ID--2, ...), or the object itself."""
-    return name.partition("--")[0]
-
-
-# --- scores and differences -------------------------------------------------------------------------------------------
-
-
-def more_scores(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
-    """PSNR inside the silhouette, and high-frequency energy over the reference's, by view."""
-    inside = item.images[..., 3] > 255 * OPAQUE
-    return jax.device_get(_more_scores(np.asarray(pictures.image), data_sets.on_white(item.images), inside))
-
-
-@jax.jit
-def _more_scores(image, reference, inside):
-    return {
-        "inside": metrics.conditional_psnr(image, reference, inside),
-        "detail": metrics.high_frequency_ratio(image, reference),
+def train_one(config: TrainConfig, dataset: data_sets.Dataset, run: Path) -> Trained:
+    """The network after its last step; a finished run is only read."""
+    every = max(500, config.num_steps // SAVES)
+    schedule = trainer.Schedule(preview_every=every, checkpoint_every=every)
+    state = trainer.train(config, dataset, run, schedule)
+    variables = optimisation.averaged_variables(state)
+    cost = {
+        "preset": config.preset,
+        "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
+        "steps": int(state.step),
+        "training_seconds": training_seconds(run),
     }
+    return Trained(config=config, variables=variables, cost=cost)
 
 
-# --- tables and picture -----------------------------------------------------------------------------------------------
+def training_seconds(run: Path) -> float:
+    """Seconds that a run's steps took over all calls, from its log: not compilation, previews and saving."""
+    seconds, before = 0.0, 0
+    for row in trainer.read_rows(run):
+        if "ms_per_step" in row:
+            seconds += (row["step"] - before) * row["ms_per_step"] / 1000
+            before = row["step"]
+    return round(seconds, 2)
 
 
-def numbers(
-    variants: Sequence[Variant], reference: str, scored: Scored, budget: Budget, dataset: data_sets.Dataset
-) -> dict:
-    """Everything that is written, and the conditions that it stands on."""
-    config = variants[0].config
-    scores = {variant.name: [of[variant.name] for of in scored.scores.values()] for variant in variants}
+# --- numbers, tables and picture --------------------------------------------------------------------------------------
+
+
+def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
+    """What the numbers stand on."""
+    counts = {f"{split} objects": len(objects) for split, objects in dataset.splits.items()}
     return {
-        "variants": {
-            variant.name: {"label": variant.label, "training_objects": len(variant.dataset.splits["train"])}
-            | means(scores[variant.name], METRICS)
-            for variant in variants
-        },
-        "minus_reference": {
-            name: {metric: difference(of, scores[reference], metric) for metric in METRICS}
-            for name, of in scores.items()
-            if name != reference
-        },
-        "test_objects": list(scored.scores),
-        "reference": reference,
-        "preset": budget.preset,
-        "steps": config.num_steps,
-        "seed": budget.seed,
         "hardware": runtime.hardware(),
-        "data": dataset.settings.get("settings", {}),
-        "views": len(scores[reference][0]["psnr"]),
+        "data": dataset.settings.get("settings", {}) | counts,
+        "test_objects": list(names),
         "points": config.test_points,
         "resolution": config.model.image_resolution,
         "metrics": metric_settings(),
     }
 
 
-def quality_table(results: Mapping) -> Table:
-    """Quality of every variant."""
-    rows = []
-    for row in results["variants"].values():
-        cells = [number(row[m], decimals, row[f"{m}_interval"]) for m, (_, decimals, _) in METRICS.items()]
-        rows.append((row["label"], tuple(cells)))
-    title = f"{len(results['test_objects'])} unseen objects, {results['views']} views each"
-    return Table(title=title, heads=HEADS, rows=tuple(rows))
+def compare(scored: Scored, first: str | None) -> dict:
+    """The scores of every method, and those of the first network minus the others."""
+    scores = list(scored.scores.values())
+    minus = {} if first is None else differences(scores, first)
+    return {"methods": summarise(scores), "compared": first, "differences": minus}
 
 
-def differences_table(results: Mapping) -> Table:
-    """Every variant minus the reference."""
-
-    def cell(found: Mapping | None, decimals: int) -> Cell:
-        if found is None:
-            return text("n/a")
-        ends = found["interval"]
-        certain = ends is not None and (ends[0] > 0 or ends[1] < 0)
-        return number(found["mean"], decimals, ends, sign="+", best=certain)
-
-    labels = {name: row["label"] for name, row in results["variants"].items()}
-    rows = tuple(
-        (labels[name], tuple(cell(changes[metric], decimals) for metric, (_, decimals, _) in METRICS.items()))
-        for name, changes in results["minus_reference"].items()
+def methods_table(
+    found: Mapping,
+    labels: Mapping[str, str],
+    columns: Sequence[str],
+    heads: Sequence[str],
+    more: Mapping[str, tuple[Cell, ...]],
+) -> Table:
+    """Quality of every method in the order of the labels, and `more` of it under heads of their own."""
+    rows = {name: (*cells, *more[name]) for name, cells in quality(found["methods"], columns).items()}
+    counts = next(iter(found["methods"].values()))
+    return Table(
+        title=f"Methods, {counts['objects']} unseen objects, {counts['views']} views",
+        heads=(*map(head, columns), *heads),
+        rows=tuple((label, rows[name]) for name, label in labels.items() if name in rows),
+        note="Means over images with 95 % bootstrap intervals over objects; the best of a column stands out.",
     )
-    note = "View by view; 95 % bootstrap intervals over objects. Bold: the interval leaves out 0."
-    return Table(title=f"Minus {labels[results['reference']]}", heads=HEADS, rows=rows, note=note)
 
 
-def notes(results: Mapping) -> list[str]:
-    """What a reader has to know of the numbers."""
-    counts = sorted({row["training_objects"] for row in results["variants"].values()})
-    return [
-        f"Budget: preset {results['preset']}, {results['steps']:,} steps each, "
-        f"{' or '.join(map(str, counts))} training objects. Seed {results['seed']}.",
-        f"Hardware: {results['hardware']}.",
-        f"Every variant: the same test objects, cameras and first {results['points']} points; "
-        f"{results['resolution']} px.",
-        f"PSNR inside: over the pixels whose opacity in the reference exceeds {OPAQUE:g}.",
-        "HF energy: above half of the Nyquist frequency in a Hann window, over the reference's; 1 is equally sharp, "
-        "less is smoother, more is noise or a sharpness that is not there.",
-        *(f"{name}: {text}." for name, text in results["metrics"].items() if name != "LPIPS"),
-    ]
+def differences_table(found: Mapping, labels: Mapping[str, str], columns: Sequence[str]) -> Table:
+    """A network minus each other method, image by image."""
+    rows = tuple(
+        (f"{labels[found['compared']]} minus {labels[name]}", tuple(difference(row.get(one), one) for one in columns))
+        for name, row in found["differences"].items()
+    )
+    note = "Image by image, with 95 % bootstrap intervals and the p-value of a sign-flip test, both over objects."
+    return Table(title="Paired differences", heads=tuple(map(head, columns)), rows=rows, note=note)
 
 
 def gallery(labels: Mapping[str, str], scored: Scored, below: Sequence[str]) -> bytes:

@@ -11,7 +11,6 @@ objects, trained steps.  The seconds of each part are those of the run that did 
 
 import dataclasses
 import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -76,7 +75,7 @@ def main(demo: Demo) -> None:
     runs = {name: demo.out / name for name in configs}
     trained = {name: read_trained(run) for name, run in runs.items()}
     outcome = evaluation.compare(trained, dataset)
-    parts = {**install_seconds(), **seconds.values, "evaluate": time.monotonic() - start}
+    parts = {**seconds.values, "evaluate": time.monotonic() - start}
     parts["total"] = sum(parts.values())
     parts = {name: round(value, 1) for name, value in parts.items()}
     write_results(demo.out, outcome, dataset.settings, parts)
@@ -132,12 +131,6 @@ class Seconds:
             if part not in self.values or spent > 10:
                 self.values[part] = self.values.get(part, 0.0) + spent
                 write_whole(self._path, json.dumps(self.values).encode())
-
-
-def install_seconds() -> dict[str, float]:
-    """Seconds that `make` took to install the environment, if it did."""
-    note = Path(sys.prefix) / "install_seconds"
-    return {"install": float(note.read_text())} if note.is_file() else {}
 
 
 if __name__ == "__main__":

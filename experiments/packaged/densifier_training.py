@@ -1,6 +1,4 @@
-"""The densifier of the package made from scratch: data without pictures, training, weights.
-
-    python -m experiments.packaged.densifier_training --meshes MESHES --left-out TEST --out runs/densifier
+"""The densifier of the package made from scratch, as part of the recipe: data without pictures, training, weights.
 
 Truth are random points of training meshes and of procedural objects, with normals that point outward.  A record holds
 the truth of one object and several clouds of it, sparse, even or random or noisy, with what the network sees of them.
@@ -23,8 +21,6 @@ from scipy.spatial import cKDTree
 
 from data_gen import procedural
 from data_gen.make.augmentation import draw_reshaping, reshape
-from experiments import entry_point
-from spnr_jax import cli
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes
@@ -38,8 +34,9 @@ from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.densifier import CHILDREN, Nodes, Places, blend, init, predict, see, turn
 from spnr_jax.surfels import geometry, sides
 from spnr_jax.surfels.geometry import Points, order_in_space
-from spnr_jax.training.weights import read_variables
 
+VARIANTS = 2  # of each mesh: itself, and a stretched one
+RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
 DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a child is compared with
 ASKED, NEAREST = 6, 6  # true points for each of a cloud that ask for a child, and the places near each
@@ -53,33 +50,14 @@ EXACT, ROBUST = 0.08, 0.15  # spacings off the surface at which a child is half 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Make the densifier of the package again."""
+    """What the densifier is made of, and where."""
 
-    meshes: Path | None = None
-    """Folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects (default: none)."""
-    left_out: tuple[Path, ...] = ()
-    """Text files with the ids of meshes that do not train."""
-    out: Path = Path("runs/densifier")
-    """Folder of records, checkpoint and weights."""
-    objects: int = 200
-    """Procedural objects."""
-    variants: int = 2
-    """Of each mesh: itself, and stretched ones."""
-    steps: int = 6000
-    """Of the training."""
-    batch: int = 1
-    """Parts of clouds in a step, of 1,024 points each; 32 on a GPU."""
-    learning_rate: float = 2e-3
-    """The highest, after which it falls along a cosine."""
-    start: Path | None = None
-    """Weights that the training starts from (default: random ones)."""
-
-
-def main(options: Options) -> None:
-    """Records, then training."""
-    cli.set_up_jax()
-    make_records(options)
-    train(options)
+    meshes: Path | None  # folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects
+    left_out: frozenset[str]  # ids of meshes that do not train
+    out: Path  # folder of records, checkpoint and weights
+    objects: int  # procedural ones
+    steps: int
+    batch: int = 1  # parts of clouds in a step, of 1,024 points each; 32 on a GPU
 
 
 # --- records ----------------------------------------------------------------------------------------------------------
@@ -87,11 +65,10 @@ def main(options: Options) -> None:
 
 def make_records(options: Options) -> None:
     """Writes the record of each object that has none, in random order."""
-    banned = {name for file in options.left_out for name in file.read_text().split()}
     jobs: list[tuple[str, Any, int]] = [(f"procedural{i}", i, 0) for i in range(options.objects)]
     for path in sorted(options.meshes.iterdir()) if options.meshes else []:
-        if path.suffix in (".glb", ".gltf", ".obj", ".ply") and path.stem not in banned:
-            jobs += [(f"{path.stem}.{variant}", path, variant) for variant in range(options.variants)]
+        if path.suffix in (".glb", ".gltf", ".obj", ".ply") and path.stem not in options.left_out:
+            jobs += [(f"{path.stem}.{variant}", path, variant) for variant in range(VARIANTS)]
     for number in np.random.default_rng(0).permutation(len(jobs)):
         name, source, variant = jobs[number]
         file = options.out / "records" / f"{name}.npz"
@@ -380,9 +357,8 @@ def measure_cover(batch: Batch, children: Any, likely: Array) -> Array:
 
 def optimizer(options: Options) -> optax.GradientTransformation:
     """Adam with a cosine schedule."""
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, options.learning_rate, min(100, options.steps // 10), options.steps, options.learning_rate / 100
-    )
+    warm_up = min(100, options.steps // 10)
+    rate = optax.warmup_cosine_decay_schedule(0.0, RATE, warm_up, options.steps, RATE / 100)
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b2=0.99))
 
 
@@ -395,8 +371,6 @@ def train(options: Options) -> None:
     first = make_batch(records, np.random.default_rng(0))
     params = init(jax.random.key(0), *jax.device_put((first.nodes, first.places)))
     print(f"{sum(x.size for x in jax.tree.leaves(params))} weights", flush=True)
-    if options.start:
-        params = read_variables(options.start)
     state = {"params": params, "rule": rule.init(params), "step": 0}
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():
@@ -438,7 +412,3 @@ def restore(path: Path, like: Any) -> Any:
     leaves, structure = jax.tree.flatten(like)
     found = read(path)
     return jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])
-
-
-if __name__ == "__main__":
-    entry_point.run(main, Options, "packaged.densifier_training")

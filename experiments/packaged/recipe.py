@@ -114,11 +114,9 @@ def generation_of(recipe: Recipe) -> GenerateConfig:
 
 def train_densifier(recipe: Recipe, dataset: data_sets.Dataset) -> None:
     """The densifier, on meshes and procedural objects of its own, without those of the test split."""
-    left_out = recipe.out / "left_out.txt"
-    write_whole(left_out, "\n".join(dataset.splits["test"]).encode())
     options = densifier_training.Options(
         meshes=recipe.meshes,
-        left_out=(left_out,),
+        left_out=frozenset(dataset.splits["test"]),
         out=recipe.out / "densifier",
         objects=scale(recipe, PROCEDURAL),
         steps=scale(recipe, DENSIFIER_STEPS),

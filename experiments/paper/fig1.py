@@ -3,7 +3,7 @@
     python -m experiments.paper.fig1 --data DIR --out DIR [--steps N] [--pretrain N] [--l1-weights 0 100]
 
     OUT/runs/l1_WEIGHT/                run folders; finished ones are only read.  OUT/runs/pretrained/
-    OUT/results.json  table.md         scores, high-frequency energy over the reference's, differences to weight 100
+    OUT/results.json  table.md         scores, high-frequency energy over the reference's, weight 100 minus the others
     OUT/gallery.png                    the figure, with that number below each picture
 
 The runs differ in the L1 weight alone: same first weights, batches and steps, and the discriminator takes part from the
@@ -22,7 +22,7 @@ from pathlib import Path
 import tyro
 
 from experiments import entry_point
-from experiments.comparison import budget, variants
+from experiments.comparison import variants
 from experiments.comparison.variants import Budget, Variant
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
@@ -59,9 +59,7 @@ def main(options: Fig1) -> None:
     dataset = data_sets.open_dataset(options.data)
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name
-    start = f"{options.pretrain} steps of L1 alone" if options.pretrain else "scratch"
-    given = (options.out, "fig1", runs, reference, options.budget, dataset)
-    variants.study(*given, {"start": start}, pretrain=options.pretrain)
+    variants.study(options.out, "fig1", runs, reference, options.budget, dataset, pretrain=options.pretrain)
 
 
 def variant(options: Fig1, weight: float, config: TrainConfig, dataset: data_sets.Dataset) -> Variant:
@@ -82,7 +80,7 @@ def pretrain(options: Fig1, dataset: data_sets.Dataset, config: TrainConfig) -> 
     before = dataclasses.replace(config, loss=loss, num_steps=options.pretrain)
     run = options.out / "runs" / "pretrained"
     print(f"before it, {options.pretrain} steps of the L1 loss alone in {run}", flush=True)
-    budget.train(before, dataset, run)
+    variants.train_one(before, dataset, run)
     return trainer.new_state(config, read_trained(run))
 
 

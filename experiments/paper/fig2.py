@@ -11,6 +11,7 @@ Two trainings of as many steps: one on the training objects and their variants, 
 the more often.  Test objects have no variants.  `spnr-data generate DIR --colour-variants 5` makes such a data set.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -45,22 +46,29 @@ def main(options: Fig2) -> None:
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     runs = trainings(options, dataset)
-    variants.study(options.out, "fig2", runs, "without", options.budget, dataset)
+    variants.study(options.out, "fig2", runs, "with", options.budget, dataset)
     write_whole(options.out / "variants.png", variants_picture(dataset, options.budget.shown))
 
 
 def trainings(options: Fig2, dataset: data_sets.Dataset) -> list[Variant]:
     """The training without variants, and that with them; ValueError if the data set has none."""
-    plain, config = variants.without_colour_variants(dataset), options.budget.config()
-    if plain.splits == dataset.splits:
+    train, config = dataset.splits["train"], options.budget.config()
+    alone = tuple(name for name in train if name == original(name))
+    if alone == train:
         raise UserError(
             f"{dataset.folder}: the training objects have no colour variants; generate a data set with "
             "`spnr-data generate DIR --colour-variants 5`"
         )
+    plain = dataclasses.replace(dataset, splits=dataset.splits | {"train": alone})
     return [
         Variant(name="without", label="Without variants", config=config, dataset=plain),
         Variant(name="with", label="With variants", config=config, dataset=dataset),
     ]
+
+
+def original(name: str) -> str:
+    """The object that a variant was made of (these are called ID--1, ID--2, ...), or the object itself."""
+    return name.partition("--")[0]
 
 
 def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
@@ -70,8 +78,8 @@ def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
     """
     found: dict[str, list[str]] = {}
     for name in sorted(dataset.splits["train"]):
-        if name != variants.original(name):
-            found.setdefault(variants.original(name), []).append(name)
+        if name != original(name):
+            found.setdefault(original(name), []).append(name)
     rows, most = [], min(MOST_SHOWN, max(map(len, found.values())))
     for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
         items = [data_sets.read_object(dataset, name) for name in (product, *found[product][:most])]

@@ -60,8 +60,6 @@ class Options:
     """Length of a turn; at least three runs."""
     threads: int = 2
     """Cores that both sides are held to."""
-    bf16: bool = False
-    """Convolutions of ours, and the twin under torch.autocast, in bfloat16; both are compared in float32."""
     quick: bool = False
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
@@ -83,7 +81,7 @@ def main(options: Options) -> None:
 
 def rows_of(options: Options) -> list[Row]:
     """All rows of these options; those that were missing are measured now."""
-    asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads", "bf16")}
+    asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads")}
     results_folder.claim(options.out, "times beside the twin", asked | {"hardware": runtime.hardware()})
     variants: tuple[str | None, ...] = options.variants
     if importlib.util.find_spec("torch") is None:
@@ -92,7 +90,7 @@ def rows_of(options: Options) -> list[Row]:
     rows = []
     for preset in options.presets:
         for mode in options.modes:
-            ours = cache(partial(our_side, preset, mode, options))
+            ours = cache(partial(our_side, preset, mode))
             for variant in variants:
                 place = options.out / "rows" / f"{preset}_{mode}_{variant}.json"
                 rows.append(results_folder.load_or_make(place, partial(measure, preset, mode, variant, ours, options)))
@@ -145,12 +143,9 @@ def our_batch(config: TrainConfig) -> Batch:
     return jax.device_put(make_batch(found))
 
 
-def our_side(preset: str, mode: Mode, options: Options) -> tuple[Run, float]:
+def our_side(preset: str, mode: Mode) -> tuple[Run, float]:
     """What to time, and the seconds that its compilation took."""
     config = our_config(preset, mode, BATCHES[preset])
-    if options.bf16:
-        assert isinstance(config.model, PaperConfig)
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, precision="bfloat16"))
     run, start = function(config, our_batch(config), mode), time.perf_counter()
     run()
     first = time.perf_counter() - start
@@ -191,8 +186,7 @@ def twin_side(preset: str, mode: Mode, variant: str, options: Options) -> Run:
     work = twin.function(config, batch, mode, compile=variant == "compiled")
 
     def run() -> None:
-        with torch.autocast(device, torch.bfloat16, enabled=options.bf16):
-            work()
+        work()
         if device == "cuda":
             torch.cuda.synchronize()
 

@@ -14,12 +14,12 @@ again from the picture alone, by gradients through `spnr_jax.encode` and `spnr_j
 materials and points are those of the points that the picture shows.  One compiled step does it all: what differs is
 the start, and the rates of Adam.
 
-    OUT/results.json, table.md  errors before and after, seconds, memory; gradients beside differences in float64
+    OUT/results.json, table.md  errors and losses; gradients beside differences in float64
     OUT/inverse.png             target, start and end
-    OUT/losses.png              mean squared error over the steps
 """
 
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -31,11 +31,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
-from matplotlib.figure import Figure
 
 import spnr_jax
 from experiments import entry_point
-from experiments.comparison import clock, figures, results_folder
+from experiments.comparison import figures, results_folder
 from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
@@ -118,14 +117,13 @@ def main(options: InverseStudy) -> None:
         pictures, found[task] = recover(params, truth, tables, plan, task, steps)
         sheet += pictures[1 if sheet else 0 :]
     checks = compare_gradients(params, truths[:1] if options.quick else truths, tables, plan)
-    costs = measure(params, truth, tables, plan, options.quick)
     rows = ["target", *(f"{task}, {when}" for task in RATES for when in ("start", "end"))]
-    files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size)), "losses.png": curves(found)}
+    files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size))}
     asked = {"points": truth.cloud.mask.shape[1], "size": size, "steps": steps, "plan": plan._asdict()}
     asked |= {"hardware": runtime.hardware(), "load": runtime.load()}
     note = f"{asked['points']} points, {size} px, {steps} steps; {asked['hardware']}, load {asked['load']}."
-    results = asked | {"objects": list(objects), "tasks": found, "gradients": checks, "costs": costs}
-    results_folder.write(options.out, results, make_tables(found, checks, costs, list(objects)), [note], files)
+    results = asked | {"objects": list(objects), "tasks": found, "gradients": checks}
+    results_folder.write(options.out, results, make_tables(found, checks, list(objects)), [note], files)
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------
@@ -258,7 +256,7 @@ def nothing(truth: Truth) -> Unknowns:
     return Unknowns(*map(jnp.zeros_like, zeros))
 
 
-# --- gradients, and what they cost ------------------------------------------------------------------------------------
+# --- gradients beside differences ------------------------------------------------------------------------------------
 
 
 def compare_gradients(params: dict, truths: Sequence[Truth], tables: Array, plan: Plan) -> dict[str, list]:
@@ -298,30 +296,6 @@ def _sum_of_pixels(
 def widen(tree: Any) -> Any:
     """The arrays in float64."""
     return jax.tree.map(lambda x: jax.device_put(np.float64(x)) if x.dtype == jnp.float32 else x, tree)
-
-
-def measure(params: dict, truth: Truth, tables: Array, plan: Plan, quick: bool) -> dict[str, dict[str, float]]:
-    """CPU seconds and MB of all pictures; if not quick, of a step and of gradients with `jax.checkpoint`, too."""
-    zero, target = nothing(truth), jnp.zeros((len(truth.light), truth.camera.height, truth.camera.width, 3))
-    given = zero, ADAM.init(zero), zero, params, truth, target, tables
-    planned = partial(loss, plan=plan)
-
-    def error(*given: Any) -> Array:
-        return planned(*given)[0]
-
-    def compiled(one: Any) -> Any:
-        every = jax.vmap(one, (0, None, 0, 0, None))
-        whole = jax.jit(lambda wrong, _state, _rates, *rest: every(wrong, *rest), compiler_options=QUICKEST)
-        return whole.lower(*given)
-
-    made = {"pictures": compiled(error)}
-    if not quick:
-        made["a step"] = step.lower(*given, plan=plan)
-        made["gradients, checkpointed"] = compiled(jax.grad(jax.checkpoint(error)))
-    programs = {name: lowered.compile() for name, lowered in made.items()}
-    seconds = clock.in_turns({name: partial(program, *given) for name, program in programs.items()}, 3)
-    memory = {name: program.memory_analysis().temp_size_in_bytes / 2**20 for name, program in programs.items()}
-    return {name: {"seconds": float(np.median(seconds[name])), "mb": memory[name]} for name in programs}
 
 
 # --- finding it again -------------------------------------------------------------------------------------------------
@@ -372,7 +346,7 @@ def errors_of(
 
 
 def recover(params: dict, truth: Truth, tables: Array, plan: Plan, task: str, steps: int) -> tuple[list, dict]:
-    """Pictures of target, start and end; errors before and after, losses, CPU seconds of a step, what overflowed."""
+    """Pictures of target, start and end; errors before and after, losses, seconds of a step, what overflowed."""
     zero, pictures, losses, seconds, overflow = nothing(truth), [], [], [], 0
     black = jnp.zeros((len(truth.light), truth.camera.height, truth.camera.width, 3))
     *_, drawn, gradient = step(zero, ADAM.init(zero), zero, params, truth, black, tables, plan)
@@ -381,11 +355,11 @@ def recover(params: dict, truth: Truth, tables: Array, plan: Plan, task: str, st
     wrong = begin(task, truth)
     state, errors = ADAM.init(wrong), [errors_of(task, wrong, truth, shown)]
     for i in range(steps + 1):  # the last, of rate 0, draws what was found
-        rates, start = [RATES[task].get(name, 0.0) * (1 - i / steps) for name in Unknowns._fields], clock.now()
+        rates, start = [RATES[task].get(name, 0.0) * (1 - i / steps) for name in Unknowns._fields], time.perf_counter()
         given = Unknowns(*map(jnp.float32, rates)), params, truth, target, tables, plan
         wrong, state, error, drawn, _ = step(wrong, state, *given)
         losses.append(np.asarray(error, float).tolist())
-        seconds.append(clock.now() - start)
+        seconds.append(time.perf_counter() - start)
         overflow = max(overflow, int(jnp.max(drawn.overflow)))
         pictures.append(drawn.image if i in (0, steps) else None)
     errors.append(errors_of(task, wrong, truth, shown))
@@ -394,32 +368,20 @@ def recover(params: dict, truth: Truth, tables: Array, plan: Plan, task: str, st
     return [list(np.asarray(x)) for x in (target, pictures[0], pictures[-1])], found | {"losses": losses}
 
 
-def make_tables(found: dict, checks: dict[str, list], costs: dict, names: list[str]) -> list[Table]:
-    """Errors and PSNR before and after (means of the objects), gradients beside differences, and costs."""
+def make_tables(found: dict, checks: dict[str, list], names: list[str]) -> list[Table]:
+    """Errors and PSNR before and after (means of the objects), and gradients beside differences."""
     rows = []
     for of in found.values():
         psnr = [number(float(np.mean(values)), 1) for values in of["psnr"]]
         for name in of["errors"][0]:
             ends = [number(float(np.mean(errors[name])), 3) for errors in of["errors"]]
             rows.append((name, (*ends, *psnr, number(of["seconds"], 2))))
-    heads = ("error before", "after", "PSNR before, dB", "after", "CPU seconds a step of all objects")
+    heads = ("error before", "after", "PSNR before, dB", "after", "seconds a step of all objects")
     apart = {name: tuple(number(100 * abs(g / d - 1), 4) for g, d in pairs) for name, pairs in checks.items()}
-    cost = [(name, (number(of["seconds"], 2), number(of["mb"], 0))) for name, of in costs.items()]
     return [
         Table(title="Recovered from one picture", heads=heads, rows=tuple(rows)),
         Table(title="Gradients beside central differences, % apart", heads=tuple(names), rows=tuple(apart.items())),
-        Table(title="Cost of all objects", heads=("CPU seconds", "MB"), rows=tuple(cost)),
     ]
-
-
-@figures.drawing
-def curves(found: Mapping[str, Any]) -> Figure:
-    """Mean squared errors: a panel for each task, a curve for each object."""
-    figure = Figure(figsize=(12, 2.6))
-    for axes, (task, of) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
-        axes.semilogy(np.array(of["losses"]))
-        axes.set(title=task, xlabel="step")
-    return figure
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What single experiments compute, apart from drawing and training: rows, fronts, classes, views, light, depth."""
+"""What single experiments compute, apart from drawing and training: views, light, depth."""
 
 import dataclasses
 
@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 from support.laws import close
-from support.surfel_clouds import camera
+from support.surfel_clouds import camera, cloud
 
+from experiments.comparison import study_objects
 from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
 from experiments.studies import inverse, relighting
-from experiments.studies.speed_accuracy import front
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels import lighting
+from spnr_jax.surfels.sides import spiral
 from spnr_jax.training import optimisation
 
 TINY = presets.tiny()
@@ -36,12 +37,6 @@ def test_the_nearest_views_look_from_the_same_side():
     angles = np.radians([[0, 90, 180], [95, 200, 300], [270, 10, 88]])
     eyes = [3 * np.stack([np.sin(a), 0 * a, np.cos(a)], axis=-1) for a in angles]
     assert nearest_views(eyes) == [1, 0, 2]
-
-
-def test_the_front_holds_what_no_other_setting_beats():
-    pairs = ((4, 20.0), (2, 18.0), (8, 21.0), (5, 19.0), (3, 20.5), (3, 20.4), (16, 21.0))
-    rows = [{"ms_view": ms, "psnr": psnr} for ms, psnr in pairs]
-    assert front(rows) == [1, 4, 2]
 
 
 def test_the_log_error_of_a_picture_that_is_right_and_of_one_half_as_bright():
@@ -70,51 +65,32 @@ def test_a_pose_turns_about_the_middle_by_its_angle_and_shifts_in_radii():
     close(quarter[:, 3], centre + turn @ (seen.cam_to_world[:, 3] - centre) + np.array([0.2, 0, 0]), atol=1e-5)
 
 
-# --- depth ------------------------------------------------------------------------------------------------------------
-
-SIZE = 64
-TRUTH = np.full((SIZE, SIZE), np.inf)
-TRUTH[20:40, 20:40] = np.linspace(2, 3, 20)[:, None]
-INSIDE = np.isfinite(TRUTH)
-SEEN, FAR = np.where(INSIDE, TRUTH, 9.0), np.full((SIZE, SIZE), 4.0)
-RIGHT = dict.fromkeys(fig3.COLUMNS, 0.0)
-
-
-def changed_at(array, place, value):
-    array = array.copy()
-    array[place] += value
-    return array
-
-
-THIN = changed_at(INSIDE * 1.0, np.s_[20:25, 20:40], -0.6)
-FLOATING = changed_at(changed_at(INSIDE * 1.0, np.s_[18:20, 20:40], 1.0), np.s_[0, :6], 0.6)  # 18: within 1/32
-CLEAR = np.where(INSIDE, 0.75, 0.0)
-OUTSIDE = SIZE**2 - 400
-DEPTHS = {  # depth, opacity, and the metrics that are not 0
-    "the truth": (SEEN, INSIDE * 1.0, {}),
-    "too far": (SEEN + 0.25, INSIDE * 1.0, dict.fromkeys(("error", "median", "bias", "surface"), 0.25)),
-    "too near": (SEEN - 0.25, INSIDE * 1.0, {"error": 0.25, "median": 0.25, "bias": -0.25, "surface": 0.25}),
-    "one pixel": (changed_at(SEEN, (30, 30), 4), INSIDE * 1.0, dict.fromkeys(("error", "bias", "surface"), 4 / 400)),
-    "holes": (np.where(THIN > 0.5, SEEN, 99.0), THIN, {"missed": 25.0}),
-    "floaters": (SEEN, FLOATING, {"floaters": 46e3 / OUTSIDE, "far_floaters": 6e3 / OUTSIDE}),
-    "far side": (
-        CLEAR * SEEN + (1 - CLEAR) * FAR,
-        CLEAR,
-        dict.fromkeys(("error", "bias"), np.mean(0.25 * (FAR - TRUTH)[INSIDE])) | {"median": 0.375},
-    ),
-}
+def test_depth_errors_at_the_points_that_the_eye_sees_are_what_their_definitions_say():
+    item, size = study_objects.cut(tiny_dataset.one_object(), views=1), tiny_dataset.SIZE
+    item = dataclasses.replace(item, cloud=cloud(0.8 * spiral(500)))  # within the outline of the picture
+    (view,), seen, empty = study_objects.each_view(item), item.images[..., 3] > 0, item.images[..., 3] == 0
+    truth = fig3.true_depth(np.asarray(item.cloud.positions), view, (size, size))[None]
+    known, full, left = np.isfinite(truth), item.images[..., 3] == 255, np.arange(size) < size // 2
+    for acc, shift, expected in (
+        (seen, 0, {}),
+        (seen, -0.25, {"error": 0.25, "median": 0.25, "bias": -0.25}),
+        (seen & ~left, 0, {"missed": 100 * (full & left).sum() / full.sum()}),
+        (seen | left, 0, {"floaters": 1000 * (empty & left).sum() / empty.sum()}),
+    ):
+        pictures = Pictures(image=np.ones((1, size, size, 3)), acc=acc * 1.0, depth=np.where(known, truth + shift, 9.0))
+        (found,) = fig3.score(item, pictures)
+        assert found == pytest.approx(dict.fromkeys(fig3.COLUMNS, 0.0) | expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", DEPTHS)
-def test_depth_errors_are_what_their_definitions_say(name):
-    depth, acc, expected = DEPTHS[name]
-    assert fig3.score(depth, acc, FAR, TRUTH) == pytest.approx(RIGHT | expected, abs=1e-9)
-
-
-def test_an_empty_view_has_floaters_and_a_full_one_has_errors():
-    ones = np.ones((SIZE, SIZE))
-    nothing, full = fig3.score(SEEN, ones, FAR, np.inf * ones), fig3.score(2 * ones, ones, FAR, 2.5 * ones)
-    floaters = {"floaters", "far_floaters"}
-    assert {name for name, x in nothing.items() if not np.isnan(x)} == floaters
-    assert {name for name, x in full.items() if np.isnan(x)} == floaters
-    assert (nothing["floaters"], full["error"]) == (1000, 0.5)
+def test_an_eye_sees_the_near_half_of_a_ball_and_nothing_behind_a_wall():
+    eye, sphere = np.array([0.5, 0.7, 3.0]), 0.9 * spiral(2000)
+    facing = ((eye - sphere) * sphere).sum(axis=1)
+    found = np.isin(np.arange(2000), fig3.visible_points(sphere - eye))
+    assert found[facing > 0].all()
+    assert not found[facing < -0.5].any()
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 30), np.linspace(-0.5, 0.5, 30))
+    wall = np.stack([x, y, 0.5 + 0 * x], axis=-1).reshape(-1, 3)
+    both = np.concatenate([wall, wall * 0.8 - (0, 0, 0.8)])
+    found = fig3.visible_points(both - (0, 0, 3.0))
+    assert len(found) == len(wall)
+    assert (found < len(wall)).all()

@@ -106,18 +106,10 @@ def read_dataset(folder: Path, main: str) -> None:
 
 
 def read_list(folder: Path, main: str) -> None:
-    """Splits that a user names, and the tables of other data sets."""
-    from data_gen.plan import sources, splits
+    """A test split that a user names."""
+    from data_gen.plan import tasks
 
-    path, known = folder / main, {"a", "b"}
-    if main.startswith("3dmodels"):
-        for name in sources.read_table(path).values():
-            place = (folder / "models" / name).resolve()
-            assert place.is_relative_to((folder / "models").resolve()), "a product outside its folder"
-        return
-    listed = splits.read_test_list(path, known) if main == "list.txt" else splits.read_split_file(path, known, None)
-    assert set().union(*listed.values()) <= known
-    assert set(listed) <= {"train", "val", "test"}
+    assert set(tasks.read_test_list(folder / main, {"a", "b"})) <= {"a", "b"}
 
 
 def read_network(folder: Path, main: str) -> None:
@@ -239,16 +231,8 @@ def datasets() -> list[Files]:
 
 
 def lists() -> list[Files]:
-    """Split files, a test list, and the tables of ABO."""
-    table = b"3dmodel_id,path,meshes\na,A/a.glb,1\nb,B/b.glb,2\n"
-    return [
-        {"splits.json": json.dumps({"train": ["a"], "test": ["b"]}).encode()},
-        {"splits.csv": b"id,split\na,train\nb,test\n"},
-        {"splits.csv": b"id,synsetId,subSynsetId,modelId,split\n1,1,1,a,train\n2,1,1,b,test\n"},
-        {"list.txt": b"a\nb\n"},
-        {"3dmodels.csv.gz": gzip.compress(table, mtime=0)},
-        {"3dmodels.csv": table},
-    ]
+    """A test list."""
+    return [{"list.txt": b"a\nb\n"}]
 
 
 def weights() -> list[Files]:

@@ -1,26 +1,12 @@
-"""Networks without training: run folders with fresh weights, and stand-ins that show the painted balls of the tests."""
-
-import functools
-from pathlib import Path
+"""A stand-in for a network, which shows the painted balls of the tests."""
 
 import numpy as np
 
 from experiments.comparison import contenders
 from spnr_jax.scoring import evaluation
-from spnr_jax.training import checkpoint, optimisation
 from support import tiny_dataset
-from support.tiny_baselines import SHRUNKEN
 
 OFFSET = 0.125  # of the depth that a stand-in shows
-
-
-@functools.cache
-def fresh(preset: str) -> Path:
-    """The run folder of a shrunken network that was never trained."""
-    folder = tiny_dataset.folder() / "fresh" / preset
-    checkpoint.write_config(folder, SHRUNKEN[preset])
-    checkpoint.save(folder, optimisation.jitted_create_state(SHRUNKEN[preset]))
-    return folder
 
 
 def stand_in() -> contenders.Method:

@@ -1,13 +1,12 @@
 """Laws of the plan: splits are by product, of the size that was asked for, and variants belong to training products."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from data_gen.__main__ import parse
 from data_gen.make.generate import describe
-from data_gen.plan import splits, tasks
+from data_gen.plan import tasks
 
 OUT = ["generate", "out"]
 
@@ -61,6 +60,9 @@ def test_a_test_list_is_the_test_split(tmp_path):
     split = planned(test_list=tmp_path / "test.txt", val_fraction=0.25).split(ids(made.tasks))
     assert split["test"] == ids(made.tasks)[3:7]
     assert len(split["val"]) == 9
+    (tmp_path / "test.txt").write_text("chair_000000 moon sun")
+    expected = f"--test-list {tmp_path / 'test.txt'}: no object moon (2 of 3 ids unknown)"
+    assert error(objects=8, test_list=tmp_path / "test.txt") == expected
 
 
 def test_originals_come_first_and_variants_fill_up_to_the_number_asked_for():
@@ -93,50 +95,6 @@ def test_fewer_training_objects_than_there_are_leave_some_aside():
     assert split["test"] == planned(test_objects=10, val_fraction=0.1).split(ids(planned().tasks))["test"]
 
 
-def test_a_split_file_decides_and_what_it_does_not_list_is_left_aside(tmp_path):
-    names = ids(planned().tasks)
-    listed = {"train": names[:20], "val": names[20:22], "test": names[30:]}
-    (tmp_path / "split.json").write_text(json.dumps(listed))
-    made = planned(split_file=tmp_path / "split.json")
-    assert ids(made.tasks) == sorted(names[:22] + names[30:])
-    assert made.split(ids(made.tasks)) == listed
-    (tmp_path / "test.json").write_text(json.dumps({"test": names[5:9]}))
-    split = planned(split_file=tmp_path / "test.json", val_fraction=0).split(names)
-    assert split["test"] == names[5:9]
-    assert len(split["train"]) == 36
-
-
-def test_of_a_split_file_of_shapenet_the_rows_of_the_class_count(tmp_path):
-    rows = ["000001,02691156,02691156,aaa,train", "000002,02958343,03100240,bbb,train"]
-    rows += ["000003,02958343,03100240,ccc,test", "000004,02958343,03100240,ddd,val"]
-    (tmp_path / "all.csv").write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
-    listed = splits.read_split_file(tmp_path / "all.csv", {"bbb", "ccc", "ddd"}, "02958343")
-    assert listed == {"train": ["bbb"], "val": ["ddd"], "test": ["ccc"]}
-    (tmp_path / "plain.csv").write_text("id,split\r\nb,test\r\na,train\r\n")
-    assert splits.read_split_file(tmp_path / "plain.csv", {"a", "b"}, None) == {"train": ["a"], "test": ["b"]}
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "expected"),
-    [
-        ("s.json", '{"train": ["chair_000000"], "test": ["chair_000000"]}', "more than once (train, test)"),
-        ("s.json", '{"train": ["chair_000000"], "test": ["moon", "sun"]}', "no object moon (2 of 3 ids unknown)"),
-        ("s.json", '{"training": []}', "expected lists of ids named train, val, test"),
-        ("s.json", '{"test": "chair_000000"}', "expected lists of ids"),
-        ("s.json", "[1]", "expected lists of ids"),
-        ("s.json", '{"test": []}', "lists no objects"),
-        ("s.json", "{", "cannot be read"),
-        ("s.csv", "name,split\na,train\n", "line 2: expected columns id"),
-        ("s.csv", "id,split\na,valid\n", "one of train, val, test"),
-    ],
-)
-def test_a_split_file_that_cannot_be_meant_is_one_line(tmp_path, name, text, expected):
-    (tmp_path / name).write_text(text)
-    message = error(objects=8, split_file=tmp_path / name)
-    assert expected in message
-    assert f"--split-file {tmp_path / name}" in message
-
-
 HERE = Path(__file__).parent
 
 
@@ -146,7 +104,6 @@ HERE = Path(__file__).parent
         ({"root": HERE}, "only with --preset"),
         ({"preset": "abo"}, "--preset abo: give --root"),
         ({"preset": "abo", "meshes": HERE}, "not together"),
-        ({"objects": 1, "test_list": HERE, "split_file": HERE}, "not together"),
         ({"objects": 8, "test_objects": 8}, "--test-objects 8: leaves none of the 8"),
         ({"colour_variants": -1}, "--colour-variants: expected 0 or more"),
         ({"train_objects": 0}, "--train-objects: expected 1 or more"),

@@ -59,6 +59,8 @@ def test_geometry_and_materials_are_sound_and_objects_enclose_volume_and_stand_o
         material = part.material
         assert 0.015 < material.base_color.min() <= material.base_color.max() < 0.96
         assert 0.045 < material.roughness.min() <= material.roughness.max() <= 1
+        assert 0 <= material.metallic.min() <= material.metallic.max() <= 1
+        assert {x.dtype for x in (material.base_color, material.roughness, material.metallic)} == {np.dtype("f4")}
         assert max(material.base_color.size // 3, material.roughness.size) <= 256**2
     corners = triangles(asset)
     assert np.einsum("fk,fk->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0

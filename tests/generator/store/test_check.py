@@ -1,4 +1,4 @@
-"""What `spnr-data check` says of leaking splits and of lights; damaged files: test_generate.py."""
+"""What `spnr-data check` says of objects; damaged files: test_generate.py."""
 
 import re
 from dataclasses import replace
@@ -7,36 +7,11 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from data_gen.store.check import object_faults, variant_faults
-
-DETAILS = {
-    "lamp": {"product": "lamp", "variant": 0},
-    "lamp--1": {"product": "lamp", "variant": 1},
-    "sofa": {"product": "sofa", "variant": 0},
-    "sofa--1": {"product": "sofa", "variant": 1},
-}
-
-
-@pytest.mark.parametrize(
-    ("splits", "faults"),
-    [
-        ({"train": ["lamp", "lamp--1", "sofa", "sofa--1"]}, []),
-        ({"train": ["lamp", "lamp--1"], "test": ["sofa"]}, []),
-        ({"train": ["lamp--1", "sofa"], "test": ["lamp"]}, ["splits: variants of lamp are in test and train"]),
-        (
-            {"train": ["lamp"], "val": ["sofa", "sofa--1"]},
-            ["splits: sofa--1 is a colour variant, but in val; only training objects have any"],
-        ),
-        ({"train": ["lamp"]}, []),
-    ],
-)
-def test_the_colour_variants_of_a_product_may_only_train_and_only_together(splits, faults):
-    assert variant_faults(splits, DETAILS) == faults
-
+from data_gen.store.check import object_faults
 
 ITEM = tiny_dataset.one_object()
 SETTINGS = {"views": tiny_dataset.VIEWS, "resolution": tiny_dataset.SIZE, "points": tiny_dataset.POINTS}
-WHOLE = {"files": {}, "product": "lamp", "variant": 0}
+WHOLE = {"files": {}}
 LIGHTS = np.ones((tiny_dataset.VIEWS, 32, 64, 3), np.float32)
 DARK = LIGHTS * np.array([1, 0, 1], np.float32)[:, None, None, None]
 
@@ -50,7 +25,7 @@ def moved(**changes):
     ("item", "details", "expected"),
     [
         (ITEM, WHOLE, None),
-        (ITEM, WHOLE | {"files": None}, "object.json: expected files, product and variant"),
+        (ITEM, {}, "object.json: expected the checksums"),
         (ITEM, WHOLE | {"files": {"points.ply": "0"}}, "points.ply has another checksum"),
         (replace(ITEM, images=ITEM.images[:2]), WHOLE, r"expected \(views, resolution\) \(3, 24\), got \(2, 24\)"),
         (ITEM, WHOLE | {"files": {"lights.npz": None}}, "lights.npz is there"),

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from data_gen.store import check, layout
 from spnr_jax.formats import data_sets
@@ -43,14 +42,6 @@ def test_an_object_reads_back_as_it_was_written(tmp_path):
     poses = [frame["transform_matrix"] for frame in record.transforms["frames"]]
     np.testing.assert_array_equal(found.camera.cam_to_world, np.float32(poses)[:, :3])
     assert check.read_details(tmp_path, "made_up").items() >= record.details.items()
-
-
-def test_other_readers_of_ply_find_the_points(tmp_path):
-    record = made_up_record()
-    (tmp_path / "points.ply").write_bytes(layout.encode_points(record.points))
-    data = trimesh.load(tmp_path / "points.ply").metadata["_ply_raw"]["vertex"]["data"]
-    for name in layout.POINT_TYPE.names:
-        np.testing.assert_array_equal(np.squeeze(data[name]), record.points[name])
 
 
 def content(folder):
