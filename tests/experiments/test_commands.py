@@ -93,6 +93,11 @@ def check_relighting(found):
     assert list(found["objects"]) == [f"sky_1k, 32, {method}" for method in relighting.METHODS]
 
 
+def check_speed_accuracy(found):
+    assert {row["group"] for row in found["rows"]} == {"level", "fewer pixels"}
+    assert all(5 < row["psnr"] < 60 and row["ms_view"] > 0 for row in found["rows"])
+
+
 def check_fig3(found):
     for ours in found["scores"]["Ours"]:
         assert ours["median"] == pytest.approx(stand_ins.OFFSET, abs=0.1)
@@ -130,6 +135,14 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
         lambda data: {"data": (data.lit,), "run": data.run(), "counts": (32,), "views": 2},
         ("gallery.png",),
         check_relighting,
+    ),
+    "studies.speed_accuracy": (
+        lambda data: {
+            **{"data": data.lit, "runs": (data.run(),), "sizes": (48,), "counts": (32,)},
+            **{"objects": 1, "views": 1, "quick": True},
+        },
+        ("front.png",),
+        check_speed_accuracy,
     ),
     "paper.fig3": (
         lambda data: {"data": data.painted, "runs": (), "quick": True},

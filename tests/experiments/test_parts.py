@@ -1,4 +1,4 @@
-"""What single experiments compute, apart from drawing and training: views, light, depth."""
+"""What single experiments compute, apart from drawing and training: fronts, views, light, depth."""
 
 import dataclasses
 
@@ -14,6 +14,7 @@ from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
 from experiments.studies import inverse, relighting
+from experiments.studies.speed_accuracy import front
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring.evaluation import Pictures
@@ -22,6 +23,12 @@ from spnr_jax.surfels.sides import spiral
 from spnr_jax.training import optimisation
 
 TINY = presets.tiny()
+
+
+def test_the_front_holds_what_no_other_setting_beats():
+    pairs = ((4, 20.0), (2, 18.0), (8, 21.0), (5, 19.0), (3, 20.5), (3, 20.4), (16, 21.0))
+    rows = [{"ms_view": ms, "psnr": psnr} for ms, psnr in pairs]
+    assert front(rows) == [1, 4, 2]
 
 
 def test_the_adversarial_loss_takes_part_from_the_first_step_and_the_weights_alone_differ():
