@@ -13,7 +13,6 @@ Every reason not to use a file is a RejectedAsset with one line.
 
 import contextlib
 import hashlib
-import logging
 import re
 import struct
 import warnings
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError, first_line, is_bug
 from spnr_jax.formats.assets import (
     Asset,
     Material,
@@ -34,13 +33,15 @@ from spnr_jax.formats.assets import (
     TransparentParts,
     make_material,
 )
+from spnr_jax.formats.columns import full_scale
 from spnr_jax.formats.gltf import gltf_points, load_gltf
 from spnr_jax.formats.obj import load_obj, obj_points
 from spnr_jax.formats.polygons import PLAIN, off_points
-from spnr_jax.formats.surface_points import bounding_box, face_areas, unit, vertex_normals
+from spnr_jax.formats.surface_points import bounding_box, face_areas, face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
+ACROSS = 0.5  # median cosine between normals and faces, below which the normals are not those of the faces
 MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
 WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
@@ -49,9 +50,6 @@ NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that 
 UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
 UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
-UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the encoding of text that is not UTF-8
-# it shows the call stacks of errors that it gets over, unless somebody takes care of them
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def assemble(asset: Asset, strict: bool) -> Asset:
@@ -108,7 +106,7 @@ def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
     kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
     kept = {name: None if values is None else values[used] for name, values in kept.items()}
     part = _settle_texture(replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64)), notes)
-    part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
+    part = replace(part, normals=_unit_normals(part, notes, strict), colors=_check_colors(part, notes))
     if part.colors is None or part.material.base_color.ndim == 1 or not strict:
         return part
     tint = part.colors[part.faces].mean(axis=(0, 1))
@@ -132,14 +130,21 @@ def _settle_texture(part: Part, notes: set[str]) -> Part:
     return part
 
 
-def _unit_normals(part: Part, notes: set[str]) -> np.ndarray | None:
-    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals."""
+def _unit_normals(part: Part, notes: set[str], strict: bool) -> np.ndarray | None:
+    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals.
+
+    None, for pictures, where most lie across their faces.
+    """
     if part.normals is None:
         return None
     length = np.linalg.norm(part.normals, axis=-1)
     good = np.isfinite(length) & (length > 0)
     if not good.any():
         notes.add("normals without a direction (flat shading is used)")
+        return None
+    cosine = np.sum(unit(part.normals[part.faces].sum(axis=1)) * unit(face_crosses(part)), axis=-1)
+    if not strict and good.all() and np.median(np.abs(cosine)) < ACROSS:
+        notes.add("normals that lie across their faces (flat shading is used)")
         return None
     if good.all():
         return part.normals / length[:, None]
@@ -154,9 +159,13 @@ def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
         return None
     if not np.isfinite(part.colors).all():
         raise RejectedAsset("has vertex colours that are not finite (NaN or infinity)")
-    if part.colors.min() < 0 or part.colors.max() > 1:
+    highest = float(part.colors.max())
+    white = full_scale(part.colors.dtype, highest, linear=highest < 2)
+    if white > 1:
+        notes.add(f"vertex colours up to {highest:g} (taken as linear in 0..{white:g})")
+    elif part.colors.min() < 0 or highest > 1:
         notes.add("vertex colours outside [0, 1] (clipped)")
-    return np.clip(part.colors, 0, 1)
+    return np.clip(part.colors / white, 0, 1)
 
 
 def _identity(material: Material) -> str:
@@ -264,7 +273,7 @@ def _refusing() -> Iterator[None]:
     except UNREADABLE as error:
         if is_bug(error):
             raise
-        text = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+        text = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
         raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
 
 

@@ -222,12 +222,17 @@ PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
 LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
-KNOWN = "expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz"
+KNOWN = "expected one of .ply .pcd .xyz .txt .csv .tsv .asc .pts .npz .npy .las .laz"
 REFUSED = [
     ("a.ply", None, "no such file"),
     ("a.xyz", "", "the file is empty"),
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
-    ("a.xyz", "# nothing yet\n", "holds 0 points"),
+    ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
+    ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS .*git lfs pull"),
+    ("a.ply", "<!DOCTYPE html>", "a web page, which is not read"),
+    ("a.ply.gz", b"\x1f\x8b", "an archive, which is not read: unpack it first"),
+    ("a.las", b"\x1f\x8b\0", "an archive, which is not read: unpack it first"),
+    ("a.glb", b"\x89PNG", "a picture or document"),
     ("a.ply", ply_bytes(LITTLE, rows=[]), "holds 0 points"),
     ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
     ("a.xyz", "0 0 1e39\n", "too large a number"),
@@ -256,7 +261,7 @@ REFUSED = [
     ("a.ply", PLY + b"element vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
     ("a.ply", PLY + b"element edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
     ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
-    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "lists"),
+    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found none"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
@@ -269,7 +274,7 @@ REFUSED = [
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
     ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
-    ("a.npz", pack_arrays({"points": np.zeros((5, 4))}), r"'points' of shape \(5, 4\)"),
+    ("a.npz", pack_arrays({"points": np.zeros((5, 5))}), r"numbers of shape \(5, 5\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
     ("a.npz", LENGTHS, "different lengths.*'x': 5.*'r': 4"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
