@@ -168,14 +168,12 @@ def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
     return np.clip(part.colors / white, 0, 1)
 
 
-def _identity(material: Material) -> str:
-    """A digest of everything that a material says."""
-    digest = hashlib.sha256()
-    for value in vars(material).values():
-        array = isinstance(value, np.ndarray | np.floating)
-        digest.update(repr((value.shape, value.dtype) if array else value).encode())
-        digest.update(value.tobytes() if array else b"")
-    return digest.hexdigest()
+def _identity(material: Material) -> tuple:
+    """Everything that a material says, with digests of its textures."""
+    values = vars(material).values()
+    return tuple(
+        (np.shape(x), hashlib.sha256(x.tobytes()).digest()) if isinstance(x, np.ndarray) else x for x in values
+    )
 
 
 def _merge(parts: list[Part]) -> Part:

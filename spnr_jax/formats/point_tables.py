@@ -87,7 +87,8 @@ def text_pieces(path: Path) -> Iterator[Columns]:
         )
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
-            table = _table(rows, layout)
+            count = len(rows[0][1].split(layout.delimiter))
+            table = load_text(rows, "line", count, layout.delimiter, ndmin=2)
             names = names or _names(header, is_comment, table, layout)
             if len(names) != table.shape[1]:
                 number, text = rows[0]
@@ -116,25 +117,25 @@ def _layout(row: str) -> Layout:
     return Layout(delimiter if delimiter == ";" or not comma else None, comma)
 
 
-def _table(rows: Sequence[Line], layout: Layout) -> np.ndarray:
-    """Numbers (rows, columns); ValueError names the first line that is not like the first one."""
+def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
+    """Numbers of numbered rows of `count` numbers; ValueError names the first, a `what`, that holds others.
+
+    Undefined numbers of every kind are NaN.
+    """
+    texts = [text for _, text in rows]
+    with contextlib.suppress(ValueError):
+        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
+    texts = [UNDEFINED.sub("nan", text) for text in texts]
     try:
-        return load_text([text for _, text in rows], delimiter=layout.delimiter, ndmin=2)
+        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
     except ValueError:
-        count = len(rows[0][1].split(layout.delimiter))
         for number, text in rows:
-            values = [value.strip() for value in text.split(layout.delimiter)]
-            if len(values) != count or not all(re.fullmatch(NUMBER, value, re.IGNORECASE) for value in values):
-                raise UserError(f"line {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
+            with contextlib.suppress(ValueError):
+                alone = np.loadtxt([UNDEFINED.sub("nan", text)], delimiter=delimiter, comments=None, **layout)
+                if "dtype" in layout or alone.shape[1] == count:
+                    continue
+            raise UserError(f"{what} {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
         raise
-
-
-def load_text(rows: Sequence[str], **layout: Any) -> np.ndarray:
-    """What NumPy reads of rows of text, among which there may be undefined numbers of every kind."""
-    try:
-        return np.loadtxt(rows, comments=None, **layout)
-    except ValueError:
-        return np.loadtxt([UNDEFINED.sub("nan", row) for row in rows], comments=None, **layout)
 
 
 def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> tuple[str, ...]:

@@ -167,7 +167,7 @@ def _equal_rows(
         if order:
             rows = np.frombuffer(file.read(count * layout.itemsize), layout)
         else:
-            rows = load_text(list(islice(_lines(file), count)), dtype=layout, ndmin=1)
+            rows = np.loadtxt(list(islice(_lines(file), count)), dtype=layout, comments=None, ndmin=1)
     except ValueError:
         return None
     lists: Lists = {name: (rows[f"{name} length"].astype(np.int64), rows[name].ravel()) for name in first}
@@ -375,16 +375,8 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
         found += len(rows)
         if not rows or (len(rows) < PIECE_LINES and found < count):
             raise UserError(f"is cut off: its header announces {count} points, the data ends after {found}")
-        try:
-            yield load_text(rows, dtype=layout, ndmin=1)
-        except ValueError:
-            wanted = len(layout.names or ())
-            for place, row in enumerate(rows, found - len(rows)):
-                try:
-                    load_text([row], dtype=layout, ndmin=1)
-                except ValueError:
-                    raise UserError(f"point {place}: expected {wanted} numbers, found {row[:SHOWN]!r}") from None
-            raise
+        numbered = list(enumerate(rows, found - len(rows)))
+        yield load_text(numbered, "point", len(layout.names or ()), dtype=layout, ndmin=1)
     if not count:
         yield np.empty(0, layout)
 

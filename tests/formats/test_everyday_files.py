@@ -38,10 +38,18 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 
 
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
+BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
+    "CRLF": ("a.csv", table(",", "\r")),
+    "tabs and empty lines": ("a.tsv", table("\t", "\n")),
+    "a byte order mark": ("a.csv", "\ufeffX;Y;Z;R;G;B\n" + table(";")),
+    "names in quotes, blanks behind commas": ("a.csv", '"x", "y", "z", "r", "g", "b"\n' + table(", ")),
+    "remarks before and among the rows": ("a.txt", "# scanned on Monday\n# x y z r g b\n" + table(" ", "\n# row")),
+    "a remark that names an axis": ("a.txt", "// the x axis points to the right\n" + table(" ")),
+    "columns in another order": ("a.txt", "//420 points\nb g r z y x\n" + table(" ", columns=BACKWARDS)),
     "count line": ("a.xyz", "420\n" + table(" ")),
     "count line, semicolons": ("a.xyz", "420\n" + table(";")),
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),

@@ -75,25 +75,6 @@ def test_arrays_of_python_2_are_read_without_a_warning(tmp_path):
 # Text
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1 2 3 0.1 0.2 0.3\n4 5 6 0.4 0.5 0.6\n",
-        "1,2,3,0.1,0.2,0.3\r\n4,5,6,0.4,0.5,0.6",
-        "1\t2\t3\t0.1\t0.2\t0.3\n\n4\t5\t6\t0.4\t0.5\t0.6\n",
-        "\ufeffX;Y;Z;R;G;B\n1;2;3;0.1;0.2;0.3\n4;5;6;0.4;0.5;0.6\n",
-        '"x", "y", "z", "r", "g", "b"\n1, 2, 3, 0.1, 0.2, 0.3\n4, 5, 6, 0.4, 0.5, 0.6\n',
-        "# scanned on Monday\n# x y z r g b\n1 2 3 .1 .2 .3\n# a remark\n4 5 6 .4 .5 .6\n",
-        "// the x axis points to the right\n1 2 3 1e-1 2e-1 3e-1\n4 5 6 4e-1 5e-1 6e-1\n",
-        "//2 points\nb g r z y x\n0.3 0.2 0.1 3 2 1\n0.6 0.5 0.4 6 5 4\n",
-    ],
-)
-def test_text_is_read_whatever_its_separator_header_and_comments(tmp_path, text):
-    columns = read_columns(write(tmp_path, "a.csv", text))
-    table = np.stack([columns[name] for name in "xyzrgb"], axis=-1)
-    np.testing.assert_array_equal(table, [[1, 2, 3, 0.1, 0.2, 0.3], [4, 5, 6, 0.4, 0.5, 0.6]])
-
-
 NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
 
 
