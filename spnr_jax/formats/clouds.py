@@ -52,6 +52,7 @@ COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
 LOST_STEP = 1e-3  # of the extent, from which on what the file itself rounded is no shape any more
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SAMPLE = 512  # points at which the file's normals are compared with the points
+FEWEST = 10  # points that tell something of a surface
 LEAST_POINTS = 100  # that tell normals, and what has no colour
 AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
 PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
@@ -305,6 +306,8 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     if merged:
         how.report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
     require_surface(places, len(positions))
+    if len(places) < FEWEST:
+        how.report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)
 
 

@@ -58,6 +58,7 @@ def assemble(asset: Asset, strict: bool) -> Asset:
         _check_columns(part)
     asset = asset if strict else _finite(asset)
     low, high = bounding_box(asset)
+    asset = asset if strict else _without_false_normals(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
     degenerate = 0
@@ -87,6 +88,19 @@ def _finite(asset: Asset) -> Asset:
     return replace(asset, parts=parts, notes=(*asset.notes, note))
 
 
+def _without_false_normals(asset: Asset) -> Asset:
+    """The asset without normals where most lie across their faces, as those of other axes do."""
+    shaded = [part for part in asset.parts if part.normals is not None]
+    means = [unit(part.normals[part.faces].sum(axis=1)) for part in shaded if part.normals is not None]
+    cosines = [
+        np.abs(np.sum(mean * unit(face_crosses(part)), axis=-1)) for mean, part in zip(means, shaded, strict=True)
+    ]
+    if not cosines or not np.median(np.concatenate(cosines)) < ACROSS:
+        return asset
+    note = "normals of the file left out: they lie across its faces"
+    return replace(asset, parts=tuple(replace(part, normals=None) for part in asset.parts), notes=(*asset.notes, note))
+
+
 def _check_columns(part: Part) -> None:
     """Refuse a part whose columns do not have one row per vertex, or whose faces name vertices that are not there."""
     count = len(part.positions)
@@ -106,7 +120,7 @@ def _clean_part(part: Part, notes: set[str], strict: bool) -> Part:
     kept: dict[str, Any] = {name: getattr(part, name) for name in WIDTHS}
     kept = {name: None if values is None else values[used] for name, values in kept.items()}
     part = _settle_texture(replace(part, **kept, faces=faces.reshape(-1, 3).astype(np.int64)), notes)
-    part = replace(part, normals=_unit_normals(part, notes, strict), colors=_check_colors(part, notes))
+    part = replace(part, normals=_unit_normals(part, notes), colors=_check_colors(part, notes))
     if part.colors is None or part.material.base_color.ndim == 1 or not strict:
         return part
     tint = part.colors[part.faces].mean(axis=(0, 1))
@@ -130,21 +144,14 @@ def _settle_texture(part: Part, notes: set[str]) -> Part:
     return part
 
 
-def _unit_normals(part: Part, notes: set[str], strict: bool) -> np.ndarray | None:
-    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals.
-
-    None, for pictures, where most lie across their faces.
-    """
+def _unit_normals(part: Part, notes: set[str]) -> np.ndarray | None:
+    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals."""
     if part.normals is None:
         return None
     length = np.linalg.norm(part.normals, axis=-1)
     good = np.isfinite(length) & (length > 0)
     if not good.any():
         notes.add("normals without a direction (flat shading is used)")
-        return None
-    cosine = np.sum(unit(part.normals[part.faces].sum(axis=1)) * unit(face_crosses(part)), axis=-1)
-    if not strict and good.all() and np.median(np.abs(cosine)) < ACROSS:
-        notes.add("normals that lie across their faces (flat shading is used)")
         return None
     if good.all():
         return part.normals / length[:, None]

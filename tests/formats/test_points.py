@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.point_clouds import SRGB, XYZRGB, ply_bytes, read, read_columns, write
+from support.point_clouds import BALL, GREEN, LINEAR, SRGB, XYZRGB, ply_bytes, read, read_columns, write
 from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_scan, compress_lzf, written
 
 from spnr_jax.formats import clouds, las, point_tables, row_files
@@ -73,6 +73,74 @@ def test_arrays_of_python_2_are_read_without_a_warning(tmp_path):
 
 
 # Text
+
+
+ROWS = [(*point, *GREEN) for point in BALL.tolist()]
+
+
+def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
+    text = "\n".join(separator.join(f"{value:g}" for value in row) + end for row in columns) + "\n"
+    return text.replace(".", ",") if comma else text
+
+
+INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
+BACKWARDS = [row[::-1] for row in ROWS]
+WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
+TEXTS = {
+    "CRLF": ("a.csv", table(",", "\r")),
+    "tabs and empty lines": ("a.tsv", table("\t", "\n")),
+    "a byte order mark": ("a.csv", "\ufeffX;Y;Z;R;G;B\n" + table(";")),
+    "names in quotes, blanks behind commas": ("a.csv", '"x", "y", "z", "r", "g", "b"\n' + table(", ")),
+    "remarks before and among the rows": ("a.txt", "# scanned on Monday\n# x y z r g b\n" + table(" ", "\n# row")),
+    "a remark that names an axis": ("a.txt", "// the x axis points to the right\n" + table(" ")),
+    "columns in another order": ("a.txt", "//420 points\nb g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "count line": ("a.xyz", "420\n" + table(" ")),
+    "count line, semicolons": ("a.xyz", "420\n" + table(";")),
+    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
+    "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
+    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
+    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" ")),
+    "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
+    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=INDEXED)),
+    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
+    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
+    "trailing semicolons": ("a.txt", table(";", ";")),
+    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
+    "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
+    ".asc": ("a.asc", table(" ")),
+    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
+    "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
+    "UTF-16, as Windows writes it": ("a.csv", ("x,y,z,r,g,b\n" + table(",")).encode("utf-16")),
+    "every value in quotes": ("a.csv", '"x","y","z","r","g","b"\n"' + table('","', '"').replace("\n", '\n"')[:-1]),
+    "a remark above": ("a.xyz", "% exported by hand\n" + table(" ")),
+    "a row with an empty field": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "1,,1,1,2,3\n"),
+    "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
+    **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
+    "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
+    "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, case):
+    cloud, _ = read(write(tmp_path, *TEXTS[case]))
+    color = 0.5 if case.startswith("grey") else LINEAR
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (420, 3)), atol=2e-3)
+
+
+def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
+    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
+    np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
+    np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
+    x, y, z = BALL.T
+    opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
+    for arrays in ({"arr_0": ROWS}, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
+        np.savez(tmp_path / "c.npz", **arrays)
+        np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
 
 NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
