@@ -187,17 +187,13 @@ def _merge(parts: list[Part]) -> Part:
     """One part of several that agree in material and in having normals; missing colours are white."""
     first = np.cumsum([0, *(len(part.positions) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
-    colors = None
-    if any(part.colors is not None for part in parts):
-        colors = np.concatenate([np.ones_like(p.positions) if p.colors is None else p.colors for p in parts])
-    return Part(
-        positions=np.concatenate([part.positions for part in parts]),
-        faces=np.concatenate(faces),
-        material=parts[0].material,
-        normals=None if parts[0].normals is None else np.concatenate([part.normals for part in parts]),
-        texcoords=None if parts[0].texcoords is None else np.concatenate([part.texcoords for part in parts]),
-        colors=colors,
-    )
+    columns: dict[str, list] = {name: [getattr(part, name) for part in parts] for name in WIDTHS}
+    if any(colors is not None for colors in columns["colors"]):
+        columns["colors"] = [np.ones_like(p.positions) if p.colors is None else p.colors for p in parts]
+    whole: dict[str, Any] = {
+        name: None if values[0] is None else np.concatenate(values) for name, values in columns.items()
+    }
+    return replace(parts[0], faces=np.concatenate(faces), **whole)
 
 
 def find_meshes(folder: Path) -> list[tuple[str, Path]]:
