@@ -179,11 +179,16 @@ def read_companion(folder: Path, uri: str, root: Path | None = None) -> bytes:
 
 
 def _beside(folder: Path, uri: str) -> Path | None:
-    """The file in the folder that a path of another machine means: its last name, in any letter case."""
-    name = unquote(uri).replace("\\", "/").rpartition("/")[2].casefold()
-    if not name or not folder.is_dir():
-        return None
-    return next((path for path in sorted(folder.iterdir()) if path.name.casefold() == name), None)
+    """The file that a path of another machine means: its longest end that is in the folder, in any letter case."""
+    names = unquote(uri).replace("\\", "/").casefold().split("/")
+    for start in range(len(names)):
+        place: Path | None = folder
+        for name in names[start:]:
+            inside = sorted(place.iterdir()) if place and place.is_dir() else []
+            place = next((path for path in inside if path.name.casefold() == name), None)
+        if place:
+            return place
+    return None
 
 
 def _inside(root: Path, folder: Path, name: str) -> Path | None:

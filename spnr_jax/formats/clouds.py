@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.config import Cut
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import ShownParts
+from spnr_jax.formats.assets import Asset, ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
@@ -46,11 +46,14 @@ MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the mo
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
 CAPACITY = 2**19  # points of a file that are in memory at most; of more a random sample is kept while reading
 BROKEN = "NaN, infinity or too large a number"
+TEXT_MESHES = (".obj", ".off")  # which write numbers of any length
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
 LOST_STEP = 1e-3  # of the extent, from which on what the file itself rounded is no shape any more
+ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SAMPLE = 512  # points at which the file's normals are compared with the points
+FEWEST = 10  # points that tell something of a surface
 LEAST_POINTS = 100  # that tell normals, and what has no colour
 AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
 PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
@@ -236,6 +239,8 @@ def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+    if kind not in TEXT_MESHES:
+        _check_vertices(asset, report)
     if _coarse(corners):  # before anything of it becomes float32
         origin = np.floor(corners[0])
         parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
@@ -294,7 +299,8 @@ def _interpret(columns: Columns, how: Reading) -> Points:
         raise UserError("holds 0 points")
     columns = keep_visible(columns, how.cut.keep_noise, how.report)
     positions = stack_columns(columns)
-    _check_steps(columns, positions, how.report)
+    _check_steps(positions, np.array([_step(columns[axis]) for axis in "xyz"]), how.report)
+    _check_values(positions, how.report)
     origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, how.report), normals(columns)
     values |= {} if directions is None else {"normals": directions}
@@ -302,16 +308,36 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     if merged:
         how.report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
     require_surface(places, len(positions))
+    if len(places) < FEWEST:
+        how.report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)
 
 
-def _check_steps(columns: Columns, positions: np.ndarray, report: Report) -> None:
+def _step(column: np.ndarray) -> float:
+    """How far the numbers of a column lie apart where they are largest, 0 where that does not matter."""
+    short = column.dtype.kind == "f" and column.dtype.itemsize <= 4
+    return float(np.spacing(np.abs(column).max())) if short else 0.0
+
+
+def _check_vertices(asset: Asset, report: Report) -> None:
+    """What `_check_steps` says of vertices, which come as float64 from files that may have them shorter."""
+    vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
+    short = vertices.astype(np.float32)
+    steps = np.spacing(np.abs(short).max(axis=0)).astype(np.float64)
+    _check_steps(vertices, steps * ((vertices == short).all() and (vertices % 1).any()), report)
+
+
+def _check_values(positions: np.ndarray, report: Report) -> None:
+    """A line where one axis of points has next to no different values beside the others."""
+    counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
+    for axis, count, width in zip("xyz", counts, extent, strict=True):
+        if 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
+            report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
+
+
+def _check_steps(positions: np.ndarray, steps: np.ndarray, report: Report) -> None:
     """A line where the file rounds an axis coarsely or has it in degrees; ValueError where no shape is left."""
     extent = np.ptp(positions, axis=0)
-    steps = np.zeros(3)
-    for i, axis in enumerate("xyz"):
-        if columns[axis].dtype.kind == "f" and columns[axis].dtype.itemsize <= 4:
-            steps[i] = np.spacing(np.abs(columns[axis]).max())
     if steps.max() > LOST_STEP * extent.max() > 0:
         raise UserError(
             f"holds points {steps.max():g} apart at best in float32, for an extent of {extent.max():g}; "

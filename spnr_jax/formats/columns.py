@@ -72,8 +72,8 @@ def rename(columns: Columns) -> Columns:
     if set(SPLAT) <= plain.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
             found[name] = np.clip(0.5 + C0 * np.asarray(plain[constant], np.float64), 0, 1)
-        if "opacity" in found:
-            found["splat_opacity"] = found.pop("opacity")
+    if "opacity" in found and plain.keys() & {SPLAT[0], "scale_0", "rot_0"}:
+        found["splat_opacity"] = found.pop("opacity")
     return {name: x for name, x in found.items() if name not in ("rgb", "rgba") or x.dtype.itemsize >= 4}
 
 
@@ -94,7 +94,9 @@ def sound(columns: Columns) -> np.ndarray:
     largest = np.finfo(np.float32).max
     mask = np.ones(len(columns["x"]), bool)
     for name in columns.keys() & set(names):
-        mask &= np.abs(np.asarray(columns[name], np.float64)) < largest
+        values = np.asarray(columns[name], np.float64)
+        # infinite is what an opacity of 0 or 1 is before the logistic function
+        mask &= ~np.isnan(values) if name == "splat_opacity" else np.abs(values) < largest
     return mask
 
 
@@ -113,7 +115,7 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
         if keep_noise or not mask.any():
             continue
         if mask.all():
-            report(f"all points are {reason}: kept")
+            report(f"all points kept, though it holds for each: {reason}")
             continue
         report(f"{int(mask.sum()):,} of {len(mask):,} points left out: {reason} (--keep-noise keeps them)")
         wanted &= ~mask
@@ -122,8 +124,8 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
 def _invisible(columns: Columns) -> np.ndarray:
     """True for points that hide next to nothing; for none where the file does not say so, or says it of all."""
-    if "splat_opacity" in columns:
-        values = np.asarray(columns["splat_opacity"], np.float64)
+    values = np.asarray(columns.get("splat_opacity", columns.get("opacity", 0)), np.float64)
+    if "splat_opacity" in columns or values.min(initial=0) < 0:
         if values.min(initial=0) >= 0 and values.max(initial=0) <= 1:
             return values < FOG
         return values < np.log(FOG / (1 - FOG))  # as Kerbl et al. write it, before the logistic function

@@ -148,7 +148,7 @@ def spz_columns(path: Path) -> Columns:
     if content[:4] != MAGIC or len(content) < 16:
         raise UserError("is not an .spz file, or its header is cut off")
     version, count = struct.unpack_from("<II", content, 4)
-    if version not in VERSIONS or content is data:
+    if version not in VERSIONS:
         raise UserError(f"is an .spz file of version {version}; versions 2 and 3 can be read: {CONVERT}")
     bits = content[13]
     if 16 + count * PACKED > len(content):

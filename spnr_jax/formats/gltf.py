@@ -26,6 +26,7 @@ from spnr_jax.formats.gltf_file import (
     decode_mesh,
     read_material,
 )
+from spnr_jax.formats.polygons import strip_faces
 from spnr_jax.surfels.gaussians import C0
 
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
@@ -57,7 +58,10 @@ def list_primitives(file: GltfFile) -> Iterator[tuple[dict, np.ndarray]]:
         node = nodes[index]
         matrix = parent @ _node_matrix(node)
         if "mesh" in node:
-            yield from ((primitive, matrix) for primitive in document["meshes"][node["mesh"]]["primitives"])
+            for primitive in document["meshes"][node["mesh"]]["primitives"]:
+                if (number := primitive["attributes"].get("COLOR_0")) is not None:
+                    document["accessors"][number]["normalized"] = True  # whole numbers always are; some writers forget
+                yield primitive, matrix
         stack += [(child, matrix) for child in reversed(node.get("children", []))]
 
 
@@ -205,6 +209,4 @@ def _triangles(order: np.ndarray, mode: str) -> np.ndarray:
         return np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_FAN":
         return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)
-    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]
-    return faces
+    return strip_faces(order)

@@ -13,7 +13,6 @@ Every reason not to use a file is a RejectedAsset with one line.
 
 import contextlib
 import hashlib
-import logging
 import re
 import struct
 import warnings
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError, first_line, is_bug
 from spnr_jax.formats.assets import (
     Asset,
     Material,
@@ -34,13 +33,15 @@ from spnr_jax.formats.assets import (
     TransparentParts,
     make_material,
 )
+from spnr_jax.formats.columns import full_scale
 from spnr_jax.formats.gltf import gltf_points, load_gltf
 from spnr_jax.formats.obj import load_obj, obj_points
 from spnr_jax.formats.polygons import PLAIN, off_points
-from spnr_jax.formats.surface_points import bounding_box, face_areas, unit, vertex_normals
+from spnr_jax.formats.surface_points import bounding_box, face_areas, face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
+ACROSS = 0.5  # median cosine between normals and faces, below which the normals are not those of the faces
 MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
 WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
@@ -49,9 +50,6 @@ NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that 
 UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
 UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
-UNREADABLE += (ImportError,)  # trimesh looks for a package that guesses the encoding of text that is not UTF-8
-# it shows the call stacks of errors that it gets over, unless somebody takes care of them
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def assemble(asset: Asset, strict: bool) -> Asset:
@@ -60,6 +58,7 @@ def assemble(asset: Asset, strict: bool) -> Asset:
         _check_columns(part)
     asset = asset if strict else _finite(asset)
     low, high = bounding_box(asset)
+    asset = asset if strict else _without_false_normals(asset)
     smallest = DEGENERATE_AREA * np.sum((high - low) ** 2)
     notes: set[str] = set(asset.ignored)
     degenerate = 0
@@ -87,6 +86,19 @@ def _finite(asset: Asset) -> Asset:
     parts = tuple(replace(part, faces=part.faces[faces]) for part, faces in zip(asset.parts, sound, strict=True))
     note = f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity"
     return replace(asset, parts=parts, notes=(*asset.notes, note))
+
+
+def _without_false_normals(asset: Asset) -> Asset:
+    """The asset without normals where most lie across their faces, as those of other axes do."""
+    shaded = [part for part in asset.parts if part.normals is not None]
+    means = [unit(part.normals[part.faces].sum(axis=1)) for part in shaded if part.normals is not None]
+    cosines = [
+        np.abs(np.sum(mean * unit(face_crosses(part)), axis=-1)) for mean, part in zip(means, shaded, strict=True)
+    ]
+    if not cosines or not np.median(np.concatenate(cosines)) < ACROSS:
+        return asset
+    note = "normals of the file left out: they lie across its faces"
+    return replace(asset, parts=tuple(replace(part, normals=None) for part in asset.parts), notes=(*asset.notes, note))
 
 
 def _check_columns(part: Part) -> None:
@@ -154,36 +166,34 @@ def _check_colors(part: Part, notes: set[str]) -> np.ndarray | None:
         return None
     if not np.isfinite(part.colors).all():
         raise RejectedAsset("has vertex colours that are not finite (NaN or infinity)")
-    if part.colors.min() < 0 or part.colors.max() > 1:
+    highest = float(part.colors.max())
+    white = full_scale(part.colors.dtype, highest, linear=highest < 2)
+    if white > 1:
+        notes.add(f"vertex colours up to {highest:g} (taken as linear in 0..{white:g})")
+    elif part.colors.min() < 0 or highest > 1:
         notes.add("vertex colours outside [0, 1] (clipped)")
-    return np.clip(part.colors, 0, 1)
+    return np.clip(part.colors / white, 0, 1)
 
 
-def _identity(material: Material) -> str:
-    """A digest of everything that a material says."""
-    digest = hashlib.sha256()
-    for value in vars(material).values():
-        array = isinstance(value, np.ndarray | np.floating)
-        digest.update(repr((value.shape, value.dtype) if array else value).encode())
-        digest.update(value.tobytes() if array else b"")
-    return digest.hexdigest()
+def _identity(material: Material) -> tuple:
+    """Everything that a material says, with digests of its textures."""
+    values = vars(material).values()
+    return tuple(
+        (np.shape(x), hashlib.sha256(x.tobytes()).digest()) if isinstance(x, np.ndarray) else x for x in values
+    )
 
 
 def _merge(parts: list[Part]) -> Part:
     """One part of several that agree in material and in having normals; missing colours are white."""
     first = np.cumsum([0, *(len(part.positions) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
-    colors = None
-    if any(part.colors is not None for part in parts):
-        colors = np.concatenate([np.ones_like(p.positions) if p.colors is None else p.colors for p in parts])
-    return Part(
-        positions=np.concatenate([part.positions for part in parts]),
-        faces=np.concatenate(faces),
-        material=parts[0].material,
-        normals=None if parts[0].normals is None else np.concatenate([part.normals for part in parts]),
-        texcoords=None if parts[0].texcoords is None else np.concatenate([part.texcoords for part in parts]),
-        colors=colors,
-    )
+    columns: dict[str, list] = {name: [getattr(part, name) for part in parts] for name in WIDTHS}
+    if any(colors is not None for colors in columns["colors"]):
+        columns["colors"] = [np.ones_like(p.positions) if p.colors is None else p.colors for p in parts]
+    whole: dict[str, Any] = {
+        name: None if values[0] is None else np.concatenate(values) for name, values in columns.items()
+    }
+    return replace(parts[0], faces=np.concatenate(faces), **whole)
 
 
 def find_meshes(folder: Path) -> list[tuple[str, Path]]:
@@ -264,7 +274,7 @@ def _refusing() -> Iterator[None]:
     except UNREADABLE as error:
         if is_bug(error):
             raise
-        text = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+        text = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
         raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
 
 

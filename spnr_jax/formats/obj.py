@@ -35,7 +35,7 @@ from spnr_jax.formats.assets import (
     read_image,
     value_texels,
 )
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
 from spnr_jax.formats.polygons import triangulate
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
@@ -87,7 +87,7 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
 
 def obj_points(path: Path) -> Columns | None:
     """The columns of the vertices of a file without faces; None if it has some."""
-    if re.search(rb"(?m)^[ \t]*f[ \t]", path.read_bytes()):
+    if re.search(rb"(^|[\r\n])[ \t]*f[ \t]", path.read_bytes()):
         return None
     text = _parse(path)
     if not text.rows["v"]:
@@ -101,7 +101,7 @@ def obj_points(path: Path) -> Columns | None:
 def _parse(path: Path) -> Text:
     """What stands in the lines of a file that matter."""
     found, material = Text({"v": [], "vt": [], "vn": []}, [], [], [], []), ""
-    for line in path.read_text("utf-8", errors="replace").replace("\\\n", " ").splitlines():
+    for line in path.read_text("utf-8-sig", errors="replace").replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword == "f":
             words = rest.partition("#")[0].split()
@@ -144,6 +144,9 @@ def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[
     corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
     if corners.min() < 0 or corners[:, 0].min() < 1:
         raise RejectedAsset("has faces that name vertices before the first: broken file")
+    for last, (keyword, rows) in zip(corners.max(axis=0), text.rows.items(), strict=True):
+        if last > len(rows):
+            raise RejectedAsset(f"has faces that name {keyword} {last} of {len(rows)}: broken file")
     positions = stack_columns(columns)[corners[:, 0] - 1]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text.corners]), text.sizes)
     number = {name: i for i, name in enumerate(looks)}
@@ -189,11 +192,11 @@ def parse_mtl(text: str) -> Library:
     library: Library = {}
     current: dict[str, str] = {}
     for line in text.splitlines():
-        keyword, _, rest = line.strip().partition(" ")
+        keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword.lower() == "newmtl":
             current = library.setdefault(rest.strip(), {})
         elif keyword and not keyword.startswith("#"):
-            current[keyword.lower()] = rest.strip()
+            current[keyword.lower()] = re.sub(r"\s#.*", "", rest).strip()
     return library
 
 
@@ -206,7 +209,7 @@ def _read_library(read: Read, folder: Path, names: str, tolerance: Tolerance) ->
             found.append(read(name.replace("\\", "/")))
         except MissingFile as missing:
             tolerance.goes_on_without(missing)
-    return "\n".join(data.decode("utf-8", errors="replace") for data in found)
+    return "\n".join(data.decode("utf-8-sig", errors="replace") for data in found)
 
 
 def _look(read: Read, name: str, library: Library, tolerance: Tolerance) -> Material | None:
@@ -230,7 +233,12 @@ def _look(read: Read, name: str, library: Library, tolerance: Tolerance) -> Mate
         except MissingFile as missing:
             tolerance.goes_on_without(missing)
     tolerance.ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
-    color = np.array([float(x) for x in entry.get("kd", "0.5 0.5 0.5").split()[:3]])
+    color = np.array([float(x) for x in entry.get("kd", "0.5").split()[:3]])
+    color = np.repeat(color, 3) if len(color) == 1 else color  # as the format has it
+    white = full_scale(color.dtype, float(color.max()), linear=bool(color.max() < 2))
+    if white > 1:
+        tolerance.ignored.add(f"MTL Kd beyond 1 (taken as 0 to {white:g})")
+        color = color / white
     if "map_kd" in maps:
         if "kd" in entry and not np.all(color == 1):
             tolerance.ignored.add("MTL Kd beside map_Kd")

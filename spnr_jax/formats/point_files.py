@@ -14,23 +14,22 @@ has them so; what they mean is the affair of spnr_jax/formats/columns.py.
 """
 
 import io
+import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.point_tables import numpy_pieces, text_pieces
-from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_ply_header
+from spnr_jax.formats.row_files import element_pieces, join_pieces, pcd_pieces, read_ply_header
 
 READERS = {
     ".ply": lambda path: _ply(path),
     ".pcd": pcd_pieces,
-    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), text_pieces),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts"), text_pieces),
     **dict.fromkeys((".npz", ".npy"), numpy_pieces),
     **dict.fromkeys((".las", ".laz"), las_pieces),
     ".spz": lambda path: iter([spz_columns(path)]),
@@ -44,6 +43,15 @@ MAGIC = (  # first bytes, and the kind that they tell; of kinds with several suf
     (b"# .PCD", (".pcd",)),
     (b"NGSP", (".spz",)),
 )
+ARCHIVES, PACKED = (b"\x1f\x8b", b"PK\3\4"), (".spz", ".npz", ".npy")  # first bytes, and kinds that begin with them
+COMMENTS = rb"(\s|#[^\n\r]*[\n\r])*"
+NUMBER = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
+TEXTS = (  # how text begins whose name may say otherwise
+    (rb"solid\b[^\0]*?\b(facet|endsolid)\b", ".stl"),
+    (COMMENTS + rb"(ST)?C?N?4?n?OFF\b", ".off"),
+    (COMMENTS + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", ".obj"),
+    (COMMENTS + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", ".xyz"),
+)
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
 # first bytes or suffix -> what it is, where its version stands (as struct has it), how to convert it
@@ -51,12 +59,16 @@ FOREIGN: dict[bytes | str, tuple] = {
     b"PXR-USDC": ("USD (binary crate)", "8x3B", BLENDER),
     b"#usda": ("USD (text)", "6x3s", BLENDER),
     b"ASTM-E57": ("an E57 scan", "<8x2I", CLOUDCOMPARE),
+    b"version https://git-lfs": ("a pointer to a file that Git LFS keeps", None, "fetch it with `git lfs pull`"),
+    **dict.fromkeys((b"<!doctype html", b"<!DOCTYPE html", b"<html"), ("a web page", None, "download the file itself")),
+    **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff", b"%PDF"), ("a picture or document", None, "give points or a mesh")),
     b"Kaydara FBX Binary": ("an FBX scene", "<23xI", BLENDER),
     ".usdz": ("USD (package)", None, BLENDER),
     **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
     ".e57": ("an E57 scan", None, CLOUDCOMPARE),
     **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz"), ("an archive", None, "unpack it first")),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
 }
 
@@ -70,12 +82,14 @@ def kind_of(path: Path) -> str:
     if path.is_dir():
         raise UserError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
     suffix = path.suffix.lower()
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: a pipe or a device; save what comes from it as a file")
     if not path.is_file():
         if suffix in known or suffix in FOREIGN:
             raise UserError(f"{path}: there is no such file")
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
     with path.open("rb") as file:
-        head = file.read(64)
+        head = file.read(4096)
     if not head and suffix in known:
         raise UserError(f"{path}: the file is empty")
     for magic, kinds in MAGIC:
@@ -84,9 +98,12 @@ def kind_of(path: Path) -> str:
     for sign, (name, version, convert) in FOREIGN.items():
         if sign == suffix if isinstance(sign, str) else head.startswith(sign):
             raise UserError(f"{path}: {name}{_version(head, version)}, which is not read: {convert}")
-    if suffix not in known:
+    if head.startswith(ARCHIVES) and suffix not in PACKED:
+        raise UserError(f"{path}: an archive, which is not read: unpack it first")
+    text = next((kind for sign, kind in TEXTS if re.match(sign, head, re.IGNORECASE)), suffix)
+    if text not in known:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
-    return suffix
+    return suffix if text == ".xyz" and (suffix == ".off" or READERS.get(suffix) is text_pieces) else text
 
 
 def _version(head: bytes, form: str | None) -> str:
@@ -103,7 +120,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
     kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
-            if read_ply_header(file).is_mesh:
+            if read_ply_header(file).faces:
                 return None
     if kind in READERS:
         return READERS[kind](path)
@@ -129,11 +146,3 @@ def _ply(path: Path) -> Iterator[Columns]:
         chunks = join_pieces(element_pieces(file, "chunk"))
         file.seek(0)
         yield decompress_columns(chunks, join_pieces(element_pieces(file)))
-
-
-def join_pieces(pieces: Iterable[Columns]) -> Columns:
-    """The columns of all pieces in one; none if there are no pieces."""
-    pieces = list(pieces)
-    if len(pieces) < 2:
-        return pieces[0] if pieces else {}
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

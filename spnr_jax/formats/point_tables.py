@@ -27,7 +27,7 @@ import zlib
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,9 @@ SHOWN = 60  # characters of a line that an error shows
 LONGEST_HEADER = 4096  # characters in which names are looked for
 NUMBER = r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)"
 WITH_COMMA = r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?"
+EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;])")  # a number that was not known
+UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)", re.IGNORECASE)  # as the libraries of Windows write it
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 INDEX = "index"  # the name of a column that only counts
 
 
@@ -62,14 +65,20 @@ class Layout(NamedTuple):
     def plain(self, text: str) -> str:
         """A row with decimal points, without separators behind the last number."""
         text = text.rstrip(" \t" + (self.delimiter or ""))
+        if self.delimiter and EMPTY.search(text):
+            text = EMPTY.sub("nan", text)
         return text.replace(",", ".") if self.decimal_comma else text
 
 
 def text_pieces(path: Path) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; the last line before the numbers may name them."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        numbered = ((number, line.strip()) for number, line in enumerate(file, 1))
+    with path.open("rb") as file:
+        encoding = "utf-16" if file.read(2) in UTF_16 else "utf-8-sig"
+    with path.open(encoding=encoding, errors="replace") as file:
+        numbered = ((number, line.strip().replace('"', "")) for number, line in enumerate(file, 1))
         header, is_comment, first = _header(numbered)
+        if not first[1]:
+            raise UserError(f"holds 0 points: no row of numbers, only {header[:SHOWN]!r}")
         layout = _layout(first[1])
         lines = (
             (number, plain)
@@ -78,7 +87,8 @@ def text_pieces(path: Path) -> Iterator[Columns]:
         )
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
-            table = _table(rows, layout)
+            count = len(rows[0][1].split(layout.delimiter))
+            table = load_text(rows, "line", count, layout.delimiter, ndmin=2)
             names = names or _names(header, is_comment, table, layout)
             if len(names) != table.shape[1]:
                 number, text = rows[0]
@@ -107,16 +117,24 @@ def _layout(row: str) -> Layout:
     return Layout(delimiter if delimiter == ";" or not comma else None, comma)
 
 
-def _table(rows: Sequence[Line], layout: Layout) -> np.ndarray:
-    """Numbers (rows, columns); ValueError names the first line that is not like the first one."""
+def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
+    """Numbers of numbered rows of `count` numbers; ValueError names the first, a `what`, that holds others.
+
+    Undefined numbers of every kind are NaN.
+    """
+    texts = [text for _, text in rows]
+    with contextlib.suppress(ValueError):
+        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
+    texts = [UNDEFINED.sub("nan", text) for text in texts]
     try:
-        return np.loadtxt([text for _, text in rows], delimiter=layout.delimiter, comments=None, ndmin=2)
+        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
     except ValueError:
-        count = len(rows[0][1].split(layout.delimiter))
         for number, text in rows:
-            values = [value.strip() for value in text.split(layout.delimiter)]
-            if len(values) != count or not all(re.fullmatch(NUMBER, value, re.IGNORECASE) for value in values):
-                raise UserError(f"line {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
+            with contextlib.suppress(ValueError):
+                alone = np.loadtxt([UNDEFINED.sub("nan", text)], delimiter=delimiter, comments=None, **layout)
+                if "dtype" in layout or alone.shape[1] == count:
+                    continue
+            raise UserError(f"{what} {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
         raise
 
 
@@ -132,7 +150,8 @@ def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> 
         if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
             names.insert(0, "")  # as R writes a table
     names = next((names for names in found if len(names) == count), found[-1])
-    if is_comment and ("x" not in names or len(names) != count):
+    named = "x" in names and len(names) == count
+    if not named and (is_comment or ("x" not in names and len(names) != count)):  # a remark
         return plain_names(table)
     if len(names) != count:
         raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
@@ -177,12 +196,12 @@ UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, RuntimeError, SyntaxError)
 UNREADABLE += (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 ARRAY_COLUMNS = {
-    **dict.fromkeys(("positions", "points", "xyz", "vertices"), ("x", "y", "z")),
+    **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
-    **dict.fromkeys(("colors", "rgb", "color"), ("r", "g", "b")),
-    "roughness": ("roughness",),
+    **dict.fromkeys(("colors", "rgb", "color"), COLOR),
+    **{name: (name,) for name in (*POSITION, *COLOR, *NORMAL, "red", "green", "blue", "intensity", "roughness")},
     **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
-    "normals": ("nx", "ny", "nz"),
+    **dict.fromkeys(("normals", "normal"), NORMAL),
 }
 
 
@@ -272,6 +291,10 @@ def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     for name, array in archive.items():
         targets = ARRAY_COLUMNS[name]
         table = array[:, None] if array.ndim == 1 else array
+        if targets == COLOR and table.shape[1:] == (4,):
+            targets = (*COLOR, "alpha")
+        if targets == POSITION and table.shape[1:] != (3,):
+            targets = plain_names(table)
         if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
             raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
         columns |= dict(zip(targets, table.T, strict=True))

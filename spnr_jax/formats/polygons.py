@@ -2,7 +2,7 @@
 
 Polygons become fans of triangles, or ears where they are not convex (Meisters 1975), so that a notch stays empty.
 
-.ply    elements vertex and face through trimesh; colours by any of the names that those of points may have
+.ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have
 .stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
         the file counts where the count is 0
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]
@@ -15,54 +15,62 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from trimesh.exchange.ply import load_ply
 
 from spnr_jax.formats.assets import Asset, Part, RejectedAsset, make_material
-from spnr_jax.formats.columns import SRGB, Columns, colors_of, rename
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
+from spnr_jax.formats.row_files import element_pieces, join_pieces, read_lists, read_ply_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
+TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
 MOST_CORNERS = 2048  # of a polygon whose ears are looked for; a larger one becomes a fan
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
 
 
 def load_ply_mesh(data: bytes) -> Asset:
-    """The raw asset of a PLY file with faces."""
-    end = data.find(b"end_header")
-    if end > 0 and b"\n" not in data[:end]:  # trimesh reads lines that end in a line feed alone
-        data = data[:end].replace(b"\r", b"\n") + b"end_header\n" + data[end + len(b"end_header\r") :]
-    loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
-    if loaded.get("faces") is None:
+    """The raw asset of a PLY file with faces, or strips of them."""
+    element = read_ply_header(io.BytesIO(data)).faces
+    if element is None:
         return Asset(parts=())
-    raw, positions = loaded["metadata"]["_ply_raw"], np.asarray(loaded["vertices"], np.float64)
-    ignored = ("texture coordinates (of formats other than glTF and OBJ)",) if "visual" in loaded else ()
-    vertices, of_faces = (_columns(raw[element]["data"]) for element in ("vertex", "face"))
-    return _colored(positions, loaded["faces"], vertices, of_faces, ignored, loaded.get("vertex_normals"))
+    vertices = join_pieces(element_pieces(io.BytesIO(data)))
+    of_faces, lists = read_lists(io.BytesIO(data), element)
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in lists), next(iter(lists), None))
+    if name is None:
+        raise RejectedAsset("has faces without lists of vertices: broken file")
+    sizes, corners = lists[name]
+    if element == "tristrips":
+        strips = (strip for row in np.split(corners, np.cumsum(sizes)[:-1]) for strip in _ended(row))
+        corners = np.concatenate([np.zeros((0, 3), np.int64), *map(strip_faces, strips)]).ravel()
+        sizes, of_faces = np.full(len(corners) // 3, 3), {}
+    texcoords = "texcoord" in lists or any(pair <= vertices.keys() for pair in TEXCOORDS)
+    ignored = ("texture coordinates (of formats other than glTF and OBJ)",) if texcoords else ()
+    return _colored(vertices, corners, sizes, of_faces, ignored)
 
 
-def _columns(data: dict | np.ndarray) -> Columns:
-    """The columns of numbers among what trimesh read of an element."""
-    names = data if isinstance(data, dict) else data.dtype.names or ()
-    columns = {name.lower(): np.asarray(data[name]) for name in names}
-    columns = {name: x[:, 0] if x.ndim == 2 and x.shape[1] == 1 else x for name, x in columns.items()}
-    return {name: column for name, column in columns.items() if column.ndim == 1 and column.dtype.kind in "fiu"}
+def strip_faces(order: np.ndarray) -> np.ndarray:
+    """Triangles (f, 3) of a strip of vertices (n,), every other one turned."""
+    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1) if len(order) > 2 else np.zeros((0, 3), np.int64)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def _ended(row: np.ndarray) -> list[np.ndarray]:
+    """The strips of a row of vertices, which -1 ends."""
+    return [strip[strip >= 0] for strip in np.split(row, np.flatnonzero(row == -1))]
 
 
 def _colored(
-    positions: np.ndarray,
-    polygons: Sequence[np.ndarray] | np.ndarray,
-    vertices: Columns,
-    polygon_columns: Columns,
-    ignored: tuple[str, ...] = (),
-    normals: np.ndarray | None = None,
+    vertices: Columns, corners: np.ndarray, sizes: np.ndarray, of_faces: Columns, ignored: tuple[str, ...] = ()
 ) -> Asset:
-    """The asset of polygons with the colours among the columns of their vertices, else of the polygons."""
-    corners = polygons.ravel() if isinstance(polygons, np.ndarray) else np.concatenate([np.zeros(0), *polygons])
-    faces, owner = triangulate(positions, corners, [len(polygon) for polygon in polygons])
+    """The asset of polygons of so many corners, with the colours of their vertices, else those of the polygons."""
+    columns = useful(vertices)
+    positions = stack_columns(columns)
+    faces, owner = triangulate(positions, corners, sizes)
+    normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     part = Part(positions=positions, faces=faces, material=make_material(), normals=normals)
-    if (found := colors_of(rename(vertices))) is not None:
+    if (found := colors_of(columns)) is not None:
         part = replace(part, colors=found[0], material=make_material(1.0))
-    elif (found := colors_of(rename(polygon_columns))) is not None:
+    elif (found := colors_of(rename(of_faces))) is not None:
         corners, colors = np.arange(faces.size).reshape(-1, 3), np.repeat(found[0][owner], 3, axis=0)
         part = Part(positions=positions[faces.ravel()], faces=corners, material=make_material(1.0), colors=colors)
     return Asset(parts=(part,), ignored=ignored, notes=tuple(found[1]) if found else ())
@@ -72,9 +80,11 @@ def load_stl(data: bytes) -> Asset:
     """The raw asset of an STL file."""
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
-        text = b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data))
-        positions = np.fromstring(text, sep=" ").reshape(-1, 3, 3)
+    if re.match(rb"\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
+        numbers = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
+        if len(numbers) % 9:
+            raise RejectedAsset(f"is cut off: {len(numbers)} coordinates, where each triangle has 9")
+        positions = numbers.reshape(-1, 3, 3)
     else:
         if len(data) < STL_HEAD:
             raise RejectedAsset(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
@@ -95,8 +105,9 @@ def load_stl(data: bytes) -> Asset:
 def load_off(data: bytes) -> Asset:
     """The raw asset of an OFF file with faces."""
     columns, rows = _off(data)
-    corners = [np.array(row[1 : 1 + int(row[0])], np.int64) for row in rows]
-    if any(len(polygon) != int(row[0]) for polygon, row in zip(corners, rows, strict=True)):
+    sizes = np.array([int(row[0]) for row in rows])
+    corners = np.concatenate([np.array(row[1 : 1 + size], np.int64) for row, size in zip(rows, sizes, strict=True)])
+    if len(corners) < sizes.sum():
         raise RejectedAsset("is cut off: a face names fewer corners than it announces")
     behind = [row[1 + int(row[0]) :] for row in rows]
     colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
@@ -104,7 +115,7 @@ def load_off(data: bytes) -> Asset:
         dict(zip(SRGB, np.array([values[:3] for values in behind], np.float64).T, strict=True)) if colored else {}
     )
     ignored = ("colours of some faces alone",) if any(behind) and not colored and SRGB[0] not in columns else ()
-    return _colored(stack_columns(columns), corners, columns, of_faces, ignored)
+    return _colored(columns, corners, sizes, of_faces, ignored)
 
 
 def off_points(path: Path) -> Columns | None:
@@ -118,7 +129,7 @@ def _off(data: bytes) -> tuple[Columns, list[list[float]]]:
     text = re.sub(r"#.*", "", data.decode("utf-8", "replace"))
     lines = [line for line in (line.strip() for line in text.splitlines()) if line]
     head = OFF_HEAD.match(lines[0]) if lines else None
-    if head is None or head[1] or head[4] or head[5]:
+    if head is None or head[4] or head[5]:
         raise RejectedAsset("is not an OFF file that can be read: expected OFF, COFF, NOFF or CNOFF in text")
     rest = lines[0][head.end() :].split()
     rows = lines[1:] if not rest else [" ".join(rest), *lines[1:]]
@@ -137,7 +148,9 @@ def _off(data: bytes) -> tuple[Columns, list[list[float]]]:
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
 
 
-def triangulate(positions: np.ndarray, corners: np.ndarray, sizes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def triangulate(
+    positions: np.ndarray, corners: np.ndarray, sizes: Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Faces (f, 3) of polygons of so many corners, vertex numbers, in their order, and the polygon that each is of."""
     count, corners = np.array(sizes, np.int64), corners.astype(np.int64)
     begin = np.cumsum(count) - count

@@ -13,7 +13,7 @@ what is wrong; the file's name is added by the caller.
 import contextlib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from io import BufferedIOBase
 from itertools import islice
@@ -24,20 +24,21 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
-from spnr_jax.formats.point_tables import SHOWN
+from spnr_jax.formats.point_tables import SHOWN, load_text
 
 PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the points that are in memory at a time
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
 
 
-Lists = tuple[str, str]  # types of a list's length and of its items
-Element = tuple[str, int, list[tuple[str, str | Lists]]]  # name, count, [(property, type)]
+Properties = list[tuple[str, str | tuple[str, str]]]  # names with types; of a list those of its length and its items
+Element = tuple[str, int, Properties]  # name, count, properties
+Lists = dict[str, tuple[np.ndarray, ...]]  # lengths (rows,), and the items of all rows one behind the other
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
-    **{"double": "f8", "float64": "f8"},
+    **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
 BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_HEADER_LIMIT = 2**20  # bytes
@@ -52,9 +53,9 @@ class PlyHeader(NamedTuple):
     elements: list[Element]  # in the order of the file
 
     @property
-    def is_mesh(self) -> bool:
-        """Whether there are faces."""
-        return any(name in FACES and count for name, count, _ in self.elements)
+    def faces(self) -> str | None:
+        """The element of faces that make it a mesh."""
+        return next((name for name, count, _ in self.elements if name in FACES and count), None)
 
 
 def read_ply_header(file: BufferedIOBase) -> PlyHeader:
@@ -89,74 +90,129 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
 
 def element_pieces(file: BufferedIOBase, wanted: str = "vertex") -> Iterator[Columns]:
     """The columns of an element of an open PLY file, some rows at a time; elements before it are skipped."""
+    return (columns for columns, _ in _pieces(file, wanted))
+
+
+def read_lists(file: BufferedIOBase, wanted: str) -> tuple[Columns, Lists]:
+    """All columns and lists of an element of an open PLY file."""
+    pieces = list(_pieces(file, wanted))
+    lists = {name: [found[name] for _, found in pieces] for name in pieces[0][1]}
+    joined = {name: tuple(map(np.concatenate, zip(*parts, strict=True))) for name, parts in lists.items()}
+    return join_pieces(columns for columns, _ in pieces), joined
+
+
+def join_pieces(pieces: Iterable[Columns]) -> Columns:
+    """The columns of all pieces in one; none if there are no pieces."""
+    pieces = list(pieces)
+    if len(pieces) < 2:
+        return pieces[0] if pieces else {}
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _pieces(file: BufferedIOBase, wanted: str) -> Iterator[tuple[Columns, Lists]]:
+    """The columns and lists of an element, some rows at a time."""
     header = read_ply_header(file)
     for name, count, properties in header.elements:
+        rows = _element_rows(file, count, properties, header.byte_order)
         if name == wanted:
-            rows = _element_rows(file, count, properties, header.byte_order)
-            yield from ({field.lower(): piece[field] for field in piece.dtype.names or ()} for piece in rows)
+            yield from (({field.lower(): column for field, column in columns.items()}, x) for columns, x in rows)
             return
-        if header.byte_order is None:
-            for _ in islice((line for line in iter(file.readline, b"") if line.strip()), count):
-                pass
-        else:
-            for _ in _element_rows(file, count, properties, header.byte_order):
-                pass
+        for _ in rows:
+            pass
     names = ", ".join(name for name, _, _ in header.elements)
     raise UserError(f"has no PLY element {wanted!r}, only {names or 'none'}")
 
 
 def _element_rows(
-    file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], order: str | None
-) -> Iterator[np.ndarray]:
-    """The records of an element, some at a time, without their lists; the file is left behind them."""
-    layout = np.dtype([(field, (order or "=") + kind) for field, kind in properties if isinstance(kind, str)])
-    if not layout.names and properties and order is None:
-        raise UserError("has only lists in its PLY element: no numbers of points")
-    if order is None:
-        lines = (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
-        if any(not isinstance(kind, str) for _, kind in properties):
-            lines = (" ".join(_without_lists(line.split(), properties)) for line in lines)
-        yield from text_rows(lines, count, layout)
-    elif all(isinstance(kind, str) for _, kind in properties):
-        yield from binary_rows(file, count, layout)
-    else:
-        yield from _rows_with_lists(file, count, properties, layout, order)
+    file: BufferedIOBase, count: int, properties: Properties, order: str | None
+) -> Iterator[tuple[Columns, Lists]]:
+    """The columns and lists of the next element, some rows at a time; the file is left behind them."""
+    if all(isinstance(kind, str) for _, kind in properties):
+        layout = np.dtype([(field, (order or "=") + str(kind)) for field, kind in properties])
+        pieces = binary_rows(file, count, layout) if order else text_rows(_lines(file), count, layout)
+        yield from (({field: piece[field] for field in layout.names or ()}, {}) for piece in pieces)
+        return
+    done = 0
+    while done < max(count, 1):
+        place, most = file.tell(), min(PIECE_LINES, count - done)
+        _, first = _any_rows(file, min(most, 1), properties, order, done)
+        file.seek(place)
+        piece = _equal_rows(file, most, properties, order, first)
+        if piece is None:
+            file.seek(place)
+            piece = _any_rows(file, most, properties, order, done)
+        yield piece
+        done += max(1, len(next(iter(piece[1].values()))[0]))
 
 
-def _without_lists(words: list[str], properties: list[tuple[str, str | Lists]]) -> list[str]:
-    """The words of a row of text that stand for single numbers."""
-    kept, place = [], 0
-    for _, kind in properties:
+def _lines(file: BufferedIOBase) -> Iterator[str]:
+    """The lines of text from the file's place on that are not empty."""
+    return (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
+
+
+def _equal_rows(
+    file: BufferedIOBase, count: int, properties: Properties, order: str | None, first: Lists
+) -> tuple[Columns, Lists] | None:
+    """At most `count` rows at once, whose lists have the lengths of the first; None where some have others."""
+    fields: list[tuple] = []
+    for name, kind in properties:
         if isinstance(kind, str):
-            kept += words[place : place + 1]
-            place += 1
-        elif place < len(words):
-            place += 1 + (int(words[place]) if words[place].isdecimal() else 0)
-    return kept
+            fields.append((name, (order or "=") + kind))
+        else:
+            length, items = ((order or "=") + part for part in kind)
+            fields += [(f"{name} length", length), (name, items, (len(first[name][1]),))]
+    layout = np.dtype(fields)
+    count = max(min(count, 1), min(count, PIECE_BYTES // layout.itemsize))
+    try:
+        if order:
+            rows = np.frombuffer(file.read(count * layout.itemsize), layout)
+        else:
+            rows = np.loadtxt(list(islice(_lines(file), count)), dtype=layout, comments=None, ndmin=1)
+    except ValueError:
+        return None
+    lists: Lists = {name: (rows[f"{name} length"].astype(np.int64), rows[name].ravel()) for name in first}
+    if len(rows) < count or any((sizes != first[name][0]).any() for name, (sizes, _) in lists.items()):
+        return None
+    return {name: rows[name] for name, _ in properties if name not in first}, lists
 
 
-def _rows_with_lists(
-    file: BufferedIOBase, count: int, properties: list[tuple[str, str | Lists]], layout: np.dtype, order: str
-) -> Iterator[np.ndarray]:
-    """`count` binary records that lists make of different lengths."""
-    for start in range(0, max(1, count), PIECE_LINES):
-        rows = []
-        for number in range(start, min(count, start + PIECE_LINES)):
-            row = []
-            for _, kind in properties:
-                length, items = (kind, kind) if isinstance(kind, str) else kind
-                data = file.read(np.dtype(length).itemsize)
-                if len(data) < np.dtype(length).itemsize:
-                    raise UserError(f"is cut off: its header announces {count} rows, the data ends after {number}")
-                if isinstance(kind, str):
-                    row.append(data)
-                    continue
-                size = int(np.frombuffer(data, order + length)[0])
+def _any_rows(
+    file: BufferedIOBase, count: int, properties: Properties, order: str | None, before: int
+) -> tuple[Columns, Lists]:
+    """`count` rows one by one, behind those `before`, with lists of any lengths."""
+    found: dict[str, list[np.ndarray]] = {name: [] for name, _ in properties}
+    sizes: dict[str, list[int]] = {name: [] for name, kind in properties if not isinstance(kind, str)}
+    for number in range(before, before + count):
+        words = iter([] if order else next(_lines(file), "").split())
+        for name, kind in properties:
+            size = 1
+            if not isinstance(kind, str):
+                size, kind = int(_take(file, words, kind[0], order, 1, number)[0]), kind[1]
                 if not 0 <= size <= LONGEST_LIST:
                     raise UserError(f"has a list of {size} items in row {number} of a PLY element: broken file")
-                file.seek(size * np.dtype(items).itemsize, 1)
-            rows.append(b"".join(row))
-        yield np.frombuffer(b"".join(rows), layout, len(rows)) if layout.names else np.empty(len(rows), layout)
+                sizes[name].append(size)
+            found[name].append(_take(file, words, kind, order, size, number))
+    kinds = {name: kind if isinstance(kind, str) else kind[1] for name, kind in properties}
+    columns = {name: np.concatenate([np.zeros(0, kinds[name]), *found[name]]) for name in found}
+    lists: Lists = {name: (np.array(sizes[name], np.int64), columns.pop(name)) for name in sizes}
+    return columns, lists
+
+
+def _take(
+    file: BufferedIOBase, words: Iterator[str], kind: str, order: str | None, size: int, number: int
+) -> np.ndarray:
+    """The next numbers of a row, of the text's words, or of the file's bytes."""
+    if order:
+        data = file.read(size * np.dtype(kind).itemsize)
+        if len(data) == size * np.dtype(kind).itemsize:
+            return np.frombuffer(data, order + kind)
+    elif len(chosen := list(islice(words, size))) == size:
+        try:
+            return np.array(chosen, str).astype(kind)
+        except (ValueError, OverflowError):
+            found = " ".join(chosen)[:SHOWN]
+            raise UserError(f"row {number} of a PLY element: expected numbers, found {found!r}") from None
+    raise UserError(f"is cut off: row {number} of a PLY element ends too early")
 
 
 def camera_row(file: BufferedIOBase) -> dict[str, float]:
@@ -202,8 +258,7 @@ def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
         header = _header(file.read(PCD_HEADER_LIMIT))
         file.seek(header.size)
         if header.encoding == "ascii":
-            lines = (text for line in file if (text := line.decode("ascii", "replace").strip()))
-            pieces = text_rows(lines, header.num_points, header.layout)
+            pieces = text_rows(_lines(file), header.num_points, header.layout)
         elif header.encoding == "binary":
             pieces = binary_rows(file, header.num_points, header.layout)
         else:
@@ -320,16 +375,8 @@ def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np
         found += len(rows)
         if not rows or (len(rows) < PIECE_LINES and found < count):
             raise UserError(f"is cut off: its header announces {count} points, the data ends after {found}")
-        try:
-            yield np.loadtxt(rows, dtype=layout, comments=None, ndmin=1)
-        except ValueError:
-            wanted = len(layout.names or ())
-            for place, row in enumerate(rows, found - len(rows)):
-                try:
-                    np.loadtxt([row], dtype=layout, comments=None, ndmin=1)
-                except ValueError:
-                    raise UserError(f"point {place}: expected {wanted} numbers, found {row[:SHOWN]!r}") from None
-            raise
+        numbered = list(enumerate(rows, found - len(rows)))
+        yield load_text(numbered, "point", len(layout.names or ()), dtype=layout, ndmin=1)
     if not count:
         yield np.empty(0, layout)
 

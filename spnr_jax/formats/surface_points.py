@@ -117,7 +117,7 @@ def _draw_points(
 
 def face_areas(part: Part) -> np.ndarray:
     """Areas (f,) of a part's triangles."""
-    return np.linalg.norm(_face_cross(part), axis=-1) / 2
+    return np.linalg.norm(face_crosses(part), axis=-1) / 2
 
 
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
@@ -138,7 +138,7 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
     opacity, normal_map = (channels.pop(name, None) for name in TEXTURES)
     if part.colors is not None:
         channels["base_color"] = channels["base_color"] * interpolate(part.colors)
-    geometric = unit(_face_cross(part)[face])
+    geometric = unit(face_crosses(part)[face])
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
     if normal_map is not None and part.texcoords is not None:
         corners = part.faces[face]
@@ -153,7 +153,7 @@ def _uniform_barycentric(uniform: np.ndarray) -> np.ndarray:
     return np.concatenate([1 - root, root * (1 - uniform[:, 1:]), root * uniform[:, 1:]], axis=-1)
 
 
-def _face_cross(part: Part) -> np.ndarray:
+def face_crosses(part: Part) -> np.ndarray:
     """Normals (f, 3) of twice the triangles' area."""
     a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
     return np.cross(b - a, c - a)

@@ -4,7 +4,6 @@ The small files are made here.  `test_all_reported_files` reads those of `../sha
 hand, prints what becomes of each, and keeps the table of docs/lab/everyday_files.md true.
 """
 
-import gzip
 import os
 import re
 import struct
@@ -12,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import splat_balls
 from support.gltf_files import GltfBuilder
-from support.point_clouds import packed_splats, ply_bytes, read, write, write_rows
+from support.point_clouds import BALL, GREEN, LINEAR, ply_bytes, read, write, write_rows
 
 from spnr_jax.config import Cut
-from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.polygons import ears
 from spnr_jax.surfels.sides import spiral
@@ -25,57 +22,7 @@ from spnr_jax.surfels.sides import spiral
 ROOT = Path(__file__).parents[2]
 REPORTS = ROOT.parent / "shared" / "data" / "reports"
 PAGE = ROOT / "docs" / "lab" / "everyday_files.md"
-BALL = np.round(spiral(420), 4)
-GREEN = (40, 170, 60)
-LINEAR = np.array([0.0212, 0.4020, 0.0452])  # of GREEN
-ROWS = [(*point, *GREEN) for point in BALL.tolist()]
 UTM = np.array([500_000.123, 5_200_000.377, 120.0])
-
-
-def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
-    text = "\n".join(separator.join(f"{value:g}" for value in row) + end for row in columns) + "\n"
-    return text.replace(".", ",") if comma else text
-
-
-INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
-WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
-DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
-POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
-TEXTS = {
-    "count line": ("a.xyz", "420\n" + table(" ")),
-    "count line, semicolons": ("a.xyz", "420\n" + table(";")),
-    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
-    "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
-    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
-    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" ")),
-    "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
-    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=INDEXED)),
-    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
-    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
-    "trailing semicolons": ("a.txt", table(";", ";")),
-    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
-    "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
-    ".asc": ("a.asc", table(" ")),
-    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
-    "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
-    "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
-    "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
-}
-
-
-@pytest.mark.parametrize("case", TEXTS)
-def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, case):
-    cloud, _ = read(write(tmp_path, *TEXTS[case]))
-    color = 0.5 if case.startswith("grey") else LINEAR
-    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (420, 3)), atol=2e-3)
-
-
-def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
-    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
-    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
-    np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
-    np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
 
 
 @pytest.mark.parametrize("space", ["srgb_rec709_display", "lin_rec709_display"])
@@ -152,6 +99,18 @@ COLORED_MESHES = {
     "packed": ("a.ply", square_ply("uint", ["rgb"], [PACKED])),
     "COFF": ("a.off", "COFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OFF, colours of faces": ("a.off", "OFF\n4 1 0\n" + "\n".join(CORNERS) + "\n4 0 1 2 3 40 170 60\n"),
+    "triangles and a polygon of four corners": (
+        "a.ply",
+        square_ply("uchar", RGB, GREEN).replace("face 2", "face 3") + "4 0 1 2 3\n",
+    ),
+    "strip": (
+        "a.ply",
+        square_ply("uchar", RGB, GREEN)[:-16].replace("face 2", "tristrips 1") + "5 0 1 3 2 -1\n",
+    ),
+    "STOFF": ("a.off", "STCOFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255 0 1\n" for c in CORNERS) + "4 0 1 2 3\n"),
+    "OBJ of bare CR": ("a.obj", ("".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE).replace("\n", "\r")),
+    "OBJ with a byte order mark": ("a.obj", "\ufeff" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
+    "OBJ named .ply": ("a.ply", "# made\n" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
     "OBJ": ("a.obj", "".join(f"v {c} 0.157 0.667 0.235\n" for c in CORNERS) + OBJ_FACE),
 }
 
@@ -161,6 +120,37 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
     cloud, lines = read(write(tmp_path, *COLORED_MESHES[case]), num_points=50)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (50, 3)), atol=2e-3)
     assert any("taken as sRGB in 0.." in line for line in lines)
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+def test_colours_of_a_scene_are_told_whatever_numbers_hold_them(tmp_path, kind):
+    white = {"u1": 255, "u2": 65535, "f4": 255}[kind]
+    colors = np.tile(np.round(LINEAR * white), (420, 1)).astype(kind)
+    for positions, mode, indices in ((BALL.astype("f4"), 0, None), (SQUARE.astype("f4"), 4, [0, 1, 2, 0, 2, 3])):
+        if (kind, mode) == ("f4", 0):
+            continue
+        builder, indices = GltfBuilder(), indices and np.array(indices, "u2")
+        builder.mesh(builder.primitive(positions, indices, mode=mode, COLOR_0=colors[: len(positions)]))
+        cloud, _ = read(builder.write(tmp_path / "a.glb"), num_points=420)
+        np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=3e-3)
+
+
+LIBRARIES = {
+    "tabs": "newmtl\ta\nKd\t0.25\t0.25\t0.25\n",
+    "a byte order mark": "\ufeffnewmtl a\nKd 0.25 0.25 0.25\n",
+    "remarks behind": "newmtl a\nKd 0.25 0.25 0.25 # grey\nNs 10 # dull\n",
+    "one value": "newmtl a\nKd 0.25\n",
+    "up to 255": "newmtl a\nKd 63.75 63.75 63.75\n",
+}
+
+
+@pytest.mark.parametrize("case", LIBRARIES)
+def test_libraries_of_materials_are_read_however_they_are_written(tmp_path, case):
+    write(tmp_path, "a.mtl", LIBRARIES[case])
+    vertices = "".join(f"v {corner}\n" for corner in CORNERS)
+    cloud, lines = read(write(tmp_path, "a.obj", f"mtllib a.mtl\n{vertices}usemtl a\n{OBJ_FACE}"), num_points=9)
+    np.testing.assert_allclose(cloud.base_color, np.full((9, 3), 0.25), atol=1e-6)
+    assert any("Kd beyond 1" in line for line in lines) == (case == "up to 255")
 
 
 def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
@@ -209,6 +199,7 @@ PART = np.arange(420) % 3 == 0
     [
         ("alpha", np.where(PART, 0, 255).astype(np.uint8)),
         ("opacity", np.where(PART, 0.001, 0.9)),
+        ("opacity", np.where(PART, -6.0, 3.0)),
         ("scalar_Classification", np.where(PART, 7.0, 2.0)),
         ("classification", np.where(PART, 18, 6).astype(np.uint8)),
         ("withheld", PART.astype(np.uint8)),
@@ -231,6 +222,7 @@ def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(t
     names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     properties = [(name, "float") for name in names]
     opacities = (np.where(PART, np.nan, 3.0), 280), (np.where(PART, 0.1, 0.9), 280), (np.full(420, 0.5), 420)
+    opacities += ((np.where(PART, -np.inf, np.inf), 280),)
     for opacity, left in opacities:
         rows = [tuple(row) for row in np.column_stack([BALL, np.zeros((420, 3)), opacity])]
         content = ply_bytes("binary_little_endian", rows=rows, properties=properties)
@@ -284,6 +276,22 @@ def test_a_file_that_rounds_an_axis_says_how_many_values_are_left(tmp_path):
         assert any(re.match(r"only \d+ distinct values along y", line) for line in lines) == coarse
 
 
+def test_a_mesh_of_short_floats_far_away_is_refused_and_rounded_points_are_told(tmp_path):
+    far = stl(2, at=UTM)
+    with pytest.raises(ValueError, match="0.5 apart at best in float32, for an extent of 1; move them"):
+        read(write(tmp_path, "a.stl", far))
+    np.save(tmp_path / "a.npy", np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]]))
+    assert "only 7 distinct values along y, 414 along another axis: is it rounded?" in read(tmp_path / "a.npy")[1]
+
+
+def test_normals_of_a_mesh_that_lie_across_its_faces_are_left_out(tmp_path):
+    for normals, kept in (([0, 0, -1], True), ([1, 0, 0], False)):
+        names = ("nx", "ny", "nz")
+        cloud, lines = read(write(tmp_path, "a.ply", square_ply("float", names, normals)), num_points=9)
+        np.testing.assert_allclose(np.abs(cloud.normals), np.tile([0, 0, 1], (9, 1)), atol=1e-6)
+        assert any("they lie across its faces" in line for line in lines) != kept
+
+
 @pytest.mark.parametrize("jitter", [0.0, 1e-6])
 def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter):
     rng = np.random.default_rng(0)
@@ -294,6 +302,12 @@ def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter
     np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
     np.testing.assert_allclose(cloud.roughness, 0.1 + np.arange(420) / 840, atol=1e-6)
     assert "2,100 of 2,520 points repeat others, and were merged with them" in lines
+
+
+def test_a_handful_of_points_is_said_to_be_one(tmp_path):
+    for count, said in ((5, True), (50, False)):
+        np.save(tmp_path / "a.npy", BALL[:count])
+        assert any("points alone" in line for line in read(tmp_path / "a.npy")[1]) == said
 
 
 def test_degrees_are_told_from_metres(tmp_path):
@@ -325,10 +339,10 @@ def test_a_wavy_polygon_of_many_corners_keeps_its_area():
     assert twice.sum() == pytest.approx(np.cross(corners, np.roll(corners, -1, axis=0))[:, 2].sum())
 
 
-def stl(count: int, tail: bytes = b"", attribute: bytes = b"\0\0") -> bytes:
+def stl(count: int, tail: bytes = b"", at: np.ndarray = SQUARE[0]) -> bytes:
     """A binary STL file of two triangles."""
-    triangles = [SQUARE[[0, 1, 2]], SQUARE[[0, 2, 3]]]
-    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + attribute for corners in triangles)
+    triangles = [at + SQUARE[[0, 1, 2]], at + SQUARE[[0, 2, 3]]]
+    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + b"\0\0" for corners in triangles)
     return b"made by a scanner".ljust(80, b"\0") + struct.pack("<I", count) + body + tail
 
 
@@ -341,6 +355,13 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
         read(write(tmp_path, "a.stl", stl(3)))
 
 
+def test_a_text_stl_in_capitals_is_none_of_bytes(tmp_path):
+    facet = "FACET NORMAL 0 0 1\nOUTER LOOP\nVERTEX 0 0 0\nVERTEX 1 0 0\nVERTEX 1 1 0\nENDLOOP\nENDFACET\n"
+    assert len(read(write(tmp_path, "a.stl", f"SOLID a\n{facet}ENDSOLID\n"), num_points=9)[0].positions) == 9
+    with pytest.raises(ValueError, match="cut off: 11 coordinates"):
+        read(write(tmp_path, "a.stl", f"solid a\n{facet}vertex 0 0"))
+
+
 def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path):
     content = square_ply("uchar", RGB, GREEN).replace("0.0 1.0 0.0 40", "nan 1.0 0.0 40")
     cloud, lines = read(write(tmp_path, "a.ply", content), num_points=100)
@@ -348,49 +369,19 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
     assert "1 face left out for a vertex that is NaN or infinity" in lines
 
 
-@pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", "COLORS.png"])
+@pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", r"Maps\COLORS.png"])
 def test_a_texture_beside_its_mesh_is_found_under_a_path_of_another_machine(tmp_path, name):
     from PIL import Image
 
-    Image.new("RGB", (4, 4), GREEN).save(tmp_path / "colors.png")
+    place = tmp_path / "maps" / "colors.png" if "Maps" in name else tmp_path / "colors.png"
+    place.parent.mkdir(exist_ok=True)
+    Image.new("RGB", (4, 4), GREEN).save(place)
     write(tmp_path, "a.mtl", f"newmtl a\nmap_Kd {name}\n")
     vertices = "".join(f"v {corner}\nvt {corner[:7]}\n" for corner in CORNERS)
     write(tmp_path, "a.obj", f"mtllib A.MTL\n{vertices}usemtl a\nf 1/1 2/2 3/3 4/4\n")
     cloud, lines = read(tmp_path / "a.obj", num_points=20)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (20, 3)), atol=2e-3)
     assert not any("missing" in line for line in lines)
-
-
-# Packed splats
-
-
-def test_our_own_spz_files_are_read_as_clouds(tmp_path):
-    splats, path = splat_balls.ball(50), tmp_path / "a.spz"
-    gaussian_files.write_splats(path, splats)
-    cloud = read_cloud(path, cut=Cut(keep_noise=True))
-    np.testing.assert_allclose(cloud.positions, splats.position, atol=1e-5)
-    assert len(read_cloud(path).positions) == np.count_nonzero(np.round(splats.opacity * 255) >= 51)
-
-
-def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path):
-    path = tmp_path / "a.spz"
-    content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(50)))
-    path.write_bytes(gzip.compress(content[:4] + b"\2" + content[5:]))
-    assert len(read_cloud(path, cut=Cut(keep_noise=True)).positions) == 50
-    for version in (1, 4):
-        path.write_bytes(gzip.compress(content[:4] + bytes([version]) + content[5:]))
-        with pytest.raises(ValueError, match=f"of version {version}; versions 2 and 3 can be read: convert it to .ply"):
-            read_cloud(path)
-    path.write_bytes(gzip.compress(content[:300]))
-    with pytest.raises(ValueError, match="cut off: its header announces 50 splats"):
-        read_cloud(path)
-
-
-def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
-    content = packed_splats(BALL, PACKED << 8 | 255)
-    cloud = read_cloud(write(tmp_path, "a.ply", content))
-    np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
 
 
 # The reported files themselves

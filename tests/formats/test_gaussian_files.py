@@ -3,12 +3,17 @@
 Without a Chromium and npm's three (support/three_js.py) the latter tests are skipped.
 """
 
+import gzip
+
 import numpy as np
 import pytest
 from support import chromium as chromium_of
 from support import splat_balls, three_js
+from support.point_clouds import BALL, LINEAR, packed_splats, write
 
+from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
+from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.surfels.gaussians import C0, rotations
 
@@ -44,6 +49,39 @@ def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
         gaussian_files.write_splats(tmp_path / name, splat_balls.ball(10))
     assert "\n" not in str(refused.value)
     assert name in str(refused.value)
+
+
+# Read as clouds
+
+
+def test_our_own_spz_files_are_read_as_clouds(tmp_path):
+    splats, path = splat_balls.ball(50), tmp_path / "a.spz"
+    gaussian_files.write_splats(path, splats)
+    cloud = read_cloud(path, cut=Cut(keep_noise=True))
+    np.testing.assert_allclose(cloud.positions, splats.position, atol=1e-5)
+    assert len(read_cloud(path).positions) == np.count_nonzero(np.round(splats.opacity * 255) >= 51)
+
+
+def test_spz_of_version_2_is_read_and_others_and_damaged_ones_are_named(tmp_path):
+    path = tmp_path / "a.spz"
+    content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(50)))
+    for unpacked in (content[:4] + b"\2" + content[5:], content):
+        path.write_bytes(gzip.compress(unpacked) if unpacked is not content else content)
+        assert len(read_cloud(path, cut=Cut(keep_noise=True)).positions) == 50
+    for version in (1, 4):
+        path.write_bytes(gzip.compress(content[:4] + bytes([version]) + content[5:]))
+        with pytest.raises(ValueError, match=f"of version {version}; versions 2 and 3 can be read: convert it to .ply"):
+            read_cloud(path)
+    path.write_bytes(gzip.compress(content[:300]))
+    with pytest.raises(ValueError, match="cut off: its header announces 50 splats"):
+        read_cloud(path)
+
+
+def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
+    content = packed_splats(BALL, 0x28AA3CFF)
+    cloud = read_cloud(write(tmp_path, "a.ply", content))
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
 
 
 # In three.js

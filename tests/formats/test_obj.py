@@ -121,7 +121,7 @@ PAINTED = f"{SQUARE}usemtl paint\nf 1 2 3\n"
         (SQUARE, None, "has no faces"),
         ("", None, "has no faces"),
         (SQUARE.replace("1 1 0", "1 nan 0") + "f 1 2 3\n", None, "not finite"),
-        (SQUARE + "f 1 2 9\n", None, "broken"),
+        (SQUARE + "f 1 2 9\n", None, "name v 9 of 4: broken"),
         (SQUARE.replace("1 1 0", "1 1") + "f 1 2 3\n", None, "broken"),
         (SQUARE + "f -5 2 3\n", None, "before the first"),
         (SQUARE.replace("1 1 0", "1 x 0") + "f 1 2 3\n", None, "broken"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.point_clouds import SRGB, XYZRGB, ply_bytes, read, read_columns, write
+from support.point_clouds import BALL, GREEN, LINEAR, SRGB, XYZRGB, ply_bytes, read, read_columns, write
 from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_scan, compress_lzf, written
 
 from spnr_jax.formats import clouds, las, point_tables, row_files
@@ -75,23 +75,72 @@ def test_arrays_of_python_2_are_read_without_a_warning(tmp_path):
 # Text
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1 2 3 0.1 0.2 0.3\n4 5 6 0.4 0.5 0.6\n",
-        "1,2,3,0.1,0.2,0.3\r\n4,5,6,0.4,0.5,0.6",
-        "1\t2\t3\t0.1\t0.2\t0.3\n\n4\t5\t6\t0.4\t0.5\t0.6\n",
-        "\ufeffX;Y;Z;R;G;B\n1;2;3;0.1;0.2;0.3\n4;5;6;0.4;0.5;0.6\n",
-        '"x", "y", "z", "r", "g", "b"\n1, 2, 3, 0.1, 0.2, 0.3\n4, 5, 6, 0.4, 0.5, 0.6\n',
-        "# scanned on Monday\n# x y z r g b\n1 2 3 .1 .2 .3\n# a remark\n4 5 6 .4 .5 .6\n",
-        "// the x axis points to the right\n1 2 3 1e-1 2e-1 3e-1\n4 5 6 4e-1 5e-1 6e-1\n",
-        "//2 points\nb g r z y x\n0.3 0.2 0.1 3 2 1\n0.6 0.5 0.4 6 5 4\n",
-    ],
-)
-def test_text_is_read_whatever_its_separator_header_and_comments(tmp_path, text):
-    columns = read_columns(write(tmp_path, "a.csv", text))
-    table = np.stack([columns[name] for name in "xyzrgb"], axis=-1)
-    np.testing.assert_array_equal(table, [[1, 2, 3, 0.1, 0.2, 0.3], [4, 5, 6, 0.4, 0.5, 0.6]])
+ROWS = [(*point, *GREEN) for point in BALL.tolist()]
+
+
+def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
+    text = "\n".join(separator.join(f"{value:g}" for value in row) + end for row in columns) + "\n"
+    return text.replace(".", ",") if comma else text
+
+
+INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
+BACKWARDS = [row[::-1] for row in ROWS]
+WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
+TEXTS = {
+    "CRLF": ("a.csv", table(",", "\r")),
+    "tabs and empty lines": ("a.tsv", table("\t", "\n")),
+    "a byte order mark": ("a.csv", "\ufeffX;Y;Z;R;G;B\n" + table(";")),
+    "names in quotes, blanks behind commas": ("a.csv", '"x", "y", "z", "r", "g", "b"\n' + table(", ")),
+    "remarks before and among the rows": ("a.txt", "# scanned on Monday\n# x y z r g b\n" + table(" ", "\n# row")),
+    "a remark that names an axis": ("a.txt", "// the x axis points to the right\n" + table(" ")),
+    "columns in another order": ("a.txt", "//420 points\nb g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "count line": ("a.xyz", "420\n" + table(" ")),
+    "count line, semicolons": ("a.xyz", "420\n" + table(";")),
+    "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
+    "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
+    "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
+    "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" ")),
+    "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
+    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=INDEXED)),
+    "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
+    "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
+    "trailing semicolons": ("a.txt", table(";", ";")),
+    "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
+    "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
+    ".asc": ("a.asc", table(" ")),
+    ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
+    "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
+    "UTF-16, as Windows writes it": ("a.csv", ("x,y,z,r,g,b\n" + table(",")).encode("utf-16")),
+    "every value in quotes": ("a.csv", '"x","y","z","r","g","b"\n"' + table('","', '"').replace("\n", '\n"')[:-1]),
+    "a remark above": ("a.xyz", "% exported by hand\n" + table(" ")),
+    "a row with an empty field": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "1,,1,1,2,3\n"),
+    "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
+    **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
+    "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
+    "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, case):
+    cloud, _ = read(write(tmp_path, *TEXTS[case]))
+    color = 0.5 if case.startswith("grey") else LINEAR
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-5)
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(color, (420, 3)), atol=2e-3)
+
+
+def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
+    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
+    np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
+    np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
+    x, y, z = BALL.T
+    opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
+    for arrays in ({"arr_0": ROWS}, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
+        np.savez(tmp_path / "c.npz", **arrays)
+        np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
 
 NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
@@ -222,12 +271,17 @@ PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
 LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
-KNOWN = "expected one of .ply .pcd .xyz .txt .csv .asc .pts .npz .npy .las .laz"
+KNOWN = "expected one of .ply .pcd .xyz .txt .csv .tsv .asc .pts .npz .npy .las .laz"
 REFUSED = [
     ("a.ply", None, "no such file"),
     ("a.xyz", "", "the file is empty"),
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
-    ("a.xyz", "# nothing yet\n", "holds 0 points"),
+    ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
+    ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS .*git lfs pull"),
+    ("a.ply", "<!DOCTYPE html>", "a web page, which is not read"),
+    ("a.ply.gz", b"\x1f\x8b", "an archive, which is not read: unpack it first"),
+    ("a.las", b"\x1f\x8b\0", "an archive, which is not read: unpack it first"),
+    ("a.glb", b"\x89PNG", "a picture or document"),
     ("a.ply", ply_bytes(LITTLE, rows=[]), "holds 0 points"),
     ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
     ("a.xyz", "0 0 1e39\n", "too large a number"),
@@ -256,7 +310,7 @@ REFUSED = [
     ("a.ply", PLY + b"element vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
     ("a.ply", PLY + b"element edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
     ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
-    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "lists"),
+    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found none"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
@@ -269,7 +323,7 @@ REFUSED = [
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
     ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
-    ("a.npz", pack_arrays({"points": np.zeros((5, 4))}), r"'points' of shape \(5, 4\)"),
+    ("a.npz", pack_arrays({"points": np.zeros((5, 5))}), r"numbers of shape \(5, 5\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
     ("a.npz", LENGTHS, "different lengths.*'x': 5.*'r': 4"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),

@@ -4,7 +4,11 @@ import numpy as np
 
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import column_pieces, join_pieces
+from spnr_jax.surfels.sides import spiral
 
+BALL = np.round(spiral(420), 4)
+GREEN = (40, 170, 60)
+LINEAR = np.array([0.0212, 0.4020, 0.0452])  # of GREEN
 SRGB = np.where(np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4)
 VERTEX = [("y", "double"), ("red", "uchar"), ("x", "float"), ("label", "short"), ("z", "float")]
 NUMPY = {"double": "f8", "uchar": "u1", "float": "f4", "short": "i2"}
