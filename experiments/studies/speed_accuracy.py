@@ -244,7 +244,7 @@ def measure(
 
 
 def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What the work gives, and its milliseconds: CPU time where JAX computes on one, so that other work does not count."""
+    """What the work gives, and its milliseconds, of CPU time where JAX computes on a CPU: other work does not count."""
     now = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
     start = now()
     result = jax.block_until_ready(work())
