@@ -289,9 +289,8 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other, with the samples of a quality."""
-    draw = partial(inference.draw, variables, volume, config=config)
-    for view, light in zip(views, lights, strict=True):
-        yield draw(view, light, options=at_quality(config, quality, volume.reach))
+    options = at_quality(config, quality, volume.reach)
+    return inference.draw_each(variables, volume, views, lights, config=config, options=options)
 
 
 def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:

@@ -99,14 +99,6 @@ def test_points_that_coincide_have_some_normal_of_unit_length(count, monkeypatch
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
-def test_noise_that_was_averaged_makes_the_neighbourhood_wider():
-    points, kept = spiral(4000).astype(np.float64), np.arange(0, 4000, 7)
-    noisy = points + np.random.default_rng(0).normal(size=points.shape) * 0.014
-    told, untold = (1 - np.sum(normals_of(noisy, kept, noise) * points[kept], axis=1) for noise in (0.085, 0.0))
-    assert np.quantile(told, 0.97) < 0.05
-    assert np.median(told) < 0.5 * np.median(untold)
-
-
 def test_thinned_points_keep_the_normals_of_their_file_and_else_get_those_of_all_points():
     ball, kept = spiral(3000), np.arange(0, 3000, 11)
     given = np.roll(ball, 1, axis=0)
