@@ -75,16 +75,6 @@ def test_normals_of_a_ball_point_away_from_its_middle_in_the_order_of_the_points
     np.testing.assert_allclose(normals_of(points, kept), spiral(count)[kept], atol=0.05)
 
 
-def test_both_sides_of_a_thin_plate_point_away_from_it():
-    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-1, 1, 45)]))
-    points = np.concatenate([np.stack([x, y, z + 0 * x], 1) for z in (0.0, 0.1)])
-    found = normals_of(points, np.arange(0, len(points), 11))
-    down = points[::11, 2] == 0
-    inner = np.abs(points[::11, :2]).max(axis=1) < 0.9
-    np.testing.assert_allclose(found[down & inner], [[0, 0, -1]] * np.sum(down & inner), atol=0.05)
-    np.testing.assert_allclose(found[~down & inner], [[0, 0, 1]] * np.sum(~down & inner), atol=0.05)
-
-
 @pytest.mark.parametrize("size", [1e-25, 1e25])
 def test_the_unit_of_length_does_not_matter(size):
     points = spiral(3000).astype(np.float64) * [1, 2, 0.5]
