@@ -4,8 +4,8 @@ Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) 
 pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU these are XLA's
 native convolutions.  On a CPU (measurements: docs/lab/cpu_forms.md):
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
-  2D   native, except for matrix products for the gradients of 2-wide windows and the kernel gradients of 4-wide windows
-       and of few output features; one matrix product for 128 input features or more
+  2D   native, but for matrix products for the kernel gradients of 2-wide and 4-wide windows; one matrix product for
+       128 input features or more
 
 Normalisations are batch statistics over the real points of padded clouds, and groups of channels of one volume.
 """
@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import per_feature
 
-FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
 FEW_PIXELS = 2  # an axis, for which a kernel is larger than what it is folded for
 MANY_FEATURES = 128  # of its input, for which one matrix product is faster than a convolution
 
@@ -113,8 +112,6 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
     `_kernel_gradient` 46 to 97.
     """
     window = kernel.shape[0]
-    if window == 2 and (stride, padding) == (1, 1):
-        return _input_gradient_of_pairs(x, kernel, cotangent)
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
     turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
@@ -122,19 +119,13 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
-    """The convolution of the input, features as pictures, with the cotangents as one large window; or products.
+    """The convolution of the input, features as pictures, with the cotangents as one large window.
 
-    With few output features the cotangents that every input pixel meets in the window are put side by side; for other
-    windows than of 3 there is one product per place in them.
+    For other windows than of 3 there is one product per place in them.
     """
-    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
-    if stride == 1 and features_out <= FEW_FEATURES:
-        met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
-        columns = jnp.concatenate(met[::-1], axis=-1)
-        dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
-        return dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
-    if window != 3 or features_out <= FEW_FEATURES:
-        flat = cotangent.reshape(-1, features_out)
+    window = kernel.shape[0]
+    if window != 3:
+        flat = cotangent.reshape(-1, kernel.shape[-1])
         seen = _windows(_pad(x, padding), window, stride)
         return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen]).reshape(kernel.shape)
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
@@ -144,17 +135,8 @@ def _kernel_gradient(x, kernel, cotangent, stride, padding):
     return jnp.transpose(dk, (1, 2, 0, 3))
 
 
-def _input_gradient_of_pairs(x, kernel, cotangent):
-    """What each place of a window of 2 gives to its input, by one matrix product, and the sum of the four."""
-    height, width, features_in = x.shape[1:]
-    given = cotangent @ jnp.moveaxis(kernel, -1, 0).reshape(kernel.shape[-1], -1)
-    given = given.reshape(*cotangent.shape[:3], 2, 2, features_in)
-    return sum(given[:, 1 - i : 1 - i + height, 1 - j : 1 - j + width, i, j] for i in (0, 1) for j in (0, 1))
-
-
 def _conv2d_cpu(x, kernel, stride, padding):
-    features_in, features_out = kernel.shape[2:]
-    if features_in >= MANY_FEATURES and features_out > FEW_FEATURES:
+    if kernel.shape[-2] >= MANY_FEATURES:
         return _columns(x, kernel, stride, padding)
     return _conv2d(x, kernel, stride, padding)
 
