@@ -16,8 +16,7 @@ into a gap, and a gap adds no interval length.  Density is 0 outside, by definit
 
 import itertools
 from collections.abc import Callable
-from functools import partial, reduce
-from operator import add
+from functools import partial
 from typing import Any, no_type_check
 
 import jax
@@ -115,6 +114,39 @@ _scatter_rows.defvjp(
     lambda rows, index, values: (_scatter_rows(rows, index, values), index),
     lambda rows, index, cotangent: (np.zeros(index.shape, jax.dtypes.float0), gather_rows(cotangent, index)),
 )
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def blend_rows(
+    table: Float[Array, "rows features"],
+    lowest: Int[Array, " batch"],
+    weights: Float[Array, "batch k"],
+    steps: tuple[int, ...],
+) -> Float[Array, "batch features"]:
+    """Sum over k of weights[:, k] * table[lowest + steps[k]]; every row must be in the table.
+
+    The gradient adds all k shares to one table, where the gradient of k gathers would add up k tables.
+    """
+    out = jnp.zeros((lowest.shape[0], table.shape[1]), table.dtype)
+    for k, step in enumerate(steps):
+        out = out + weights[:, k, None] * _gather(table, lowest + step)
+    return out
+
+
+def _blend_fwd(table, lowest, weights, steps):
+    return blend_rows(table, lowest, weights, steps), (table, lowest, weights)
+
+
+def _blend_bwd(steps, residuals, cotangent):
+    table, lowest, weights = residuals
+    sums, shares = jnp.zeros_like(table), []
+    for k, step in enumerate(steps):
+        sums = _scatter(sums, lowest + step, weights[:, k, None] * cotangent)
+        shares.append(jnp.sum(cotangent * _gather(table, lowest + step), axis=-1))
+    return sums, np.zeros(lowest.shape, jax.dtypes.float0), jnp.stack(shares, axis=-1)
+
+
+blend_rows.defvjp(_blend_fwd, _blend_bwd)
 
 
 # --- voxels -----------------------------------------------------------------------------------------------------------
@@ -232,8 +264,7 @@ def trilinear(
     lowest, weights, steps = corners(positions, resolution)
     if objects is not None:
         lowest = lowest + objects.reshape(-1) * resolution**3
-    table = volume.reshape(-1, volume.shape[-1])
-    out = reduce(add, (weights[:, k, None] * gather_rows(table, lowest + step) for k, step in enumerate(steps)))
+    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, weights, steps)
     return out.reshape(*positions.shape[:-1], volume.shape[-1])
 
 
