@@ -152,37 +152,59 @@ def map_blocks(
     """What the work gives for each block of points, end to end.
 
     It is called with the neighborhoods of the block, which hold these columns of the neighbors, with the neighbors'
-    numbers, and with the rows of `own` arrays (..., points).  A gradient keeps the inputs of a block alone and computes
-    the block anew.
+    numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.  A gradient
+    keeps the inputs of a block alone and computes the block anew.
     """
     count = points.mask.shape[0]
     size = min(rules.block, count)
     table = jnp.concatenate([points.position, columns])
+    number, packed = points.number, _pack((points.position, own))
     forms: list[Any] = []
 
-    def compute(number: Array, place: Array, *values: Any) -> Any:
-        forms.append(work(layers.look_around(number, place, table), number, *values))
-        return forms[-1]
+    def compute(number: Array, packed: Array) -> Array:
+        place, values = _unpack(packed, (points.position, own))
+        out = work(layers.look_around(number, place, table), number, *values)
+        forms.append(out)
+        return _pack(out)
 
-    def skip(*_: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), forms[-1])
+    def skip(number: Array, packed: Array) -> Array:
+        rows = sum(leaf.size // size for leaf in jax.tree.leaves(forms[-1]))
+        return jnp.zeros((rows, size), packed.dtype)
 
-    def one(block: tuple) -> Any:
+    def one(block: tuple[Array, Array]) -> Array:
         return jax.lax.cond(jnp.any(block[0] >= 0), compute, skip, *block)  # blocks of padding cost nothing
 
     if size == count:
-        return jax.checkpoint(compute)(points.number, points.position, *own)
-    blocks = _split(points.number, size, -1), *jax.tree.map(lambda x: _split(x, size, 0), (points.position, *own))
-    found = jax.lax.map(jax.checkpoint(one), blocks)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :count], found)
+        return _unpack(jax.checkpoint(compute)(number, packed), forms[-1])
+
+    found = jax.lax.map(jax.checkpoint(one), (_split(number, size, -1), _split(packed, size, 0)))
+    return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
 
 
 def _split(values: Array, size: int, fill: int) -> Array:
-    """Values (..., points) of all points as blocks of so many, filled up."""
-    blocks = -(-values.shape[-1] // size)
-    short = [(0, 0)] * (values.ndim - 1) + [(0, blocks * size - values.shape[-1])]
-    values = jnp.pad(values, short, constant_values=fill)
-    return jnp.moveaxis(values.reshape(*values.shape[:-1], blocks, size), -2, 0)
+    """Columns of all points as blocks of so many, filled up."""
+    blocks = -(-values.shape[1] // size)
+    values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
+    return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
+
+
+def _pack(tree: Any) -> Float[Array, "columns points"]:
+    """All arrays (..., points) of a tree below each other; truths as 0 and 1."""
+    leaves = jax.tree.leaves(tree)
+    kind = jnp.result_type(*(leaf.dtype for leaf in leaves if leaf.dtype != bool))
+    return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]).astype(kind) for leaf in leaves])
+
+
+def _unpack(packed: Float[Array, "columns points"], form: Any) -> Any:
+    """The tree of this form that was packed, of however many points."""
+    leaves, structure = jax.tree.flatten(form)
+    found, first = [], 0
+    for leaf in leaves:
+        rows = leaf.size // leaf.shape[-1]
+        values = packed[first : first + rows].reshape(*leaf.shape[:-1], packed.shape[-1])
+        found.append(values > 0.5 if leaf.dtype == bool else values)
+        first += rows
+    return jax.tree.unflatten(structure, found)
 
 
 def find_layers(
