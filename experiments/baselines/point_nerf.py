@@ -37,7 +37,7 @@ from spnr_jax.devices.programs import split_objects
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
-from spnr_jax.kernels.numerics import length, per_feature, softplus
+from spnr_jax.kernels.numerics import length, per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.kernels.voxels import map_existing
 
@@ -253,7 +253,7 @@ def shade(
     encoded = waves(jnp.concatenate([offset, seen], axis=-1), config.offset_frequencies)
     feature = mlp(weights["near"], jnp.concatenate([features[index], encoded], axis=-1))
     feature = mlp(weights["colored"], jnp.concatenate([feature, cloud.base_color[index]], axis=-1))
-    density = config.density_scale * softplus(dense(weights["density"][0], feature)[..., 0] - 1)
+    density = config.density_scale * nn.softplus(dense(weights["density"][0], feature)[..., 0] - 1)
     away = jnp.maximum(length(offset), 1e-6)
     share = jnp.where(valid, 1 / away, 0.0)
     share = share / jnp.maximum(jnp.sum(share, axis=-1, keepdims=True), 1e-8)

@@ -29,7 +29,7 @@ from spnr_jax.config import LossConfig, Material, NetworkConfig, OptimizerConfig
 from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
-from spnr_jax.kernels.numerics import per_feature, softplus
+from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.nn.paper_layers import encode_direction
 
@@ -177,7 +177,7 @@ def nerf(
         x = x @ kernel + per_feature(bias, x)
         x = nn.relu(x) if number + 1 < len(weights) else x
     raw = x.reshape(*positions.shape[:-1], 4)
-    return softplus(raw[..., 3]), nn.sigmoid(raw[..., :3])
+    return nn.softplus(raw[..., 3]), nn.sigmoid(raw[..., :3])
 
 
 def kl_divergence(

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.devices.programs import object_groups
 from spnr_jax.kernels import sampling
-from spnr_jax.kernels.numerics import clamp, compute_once
+from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rays
 
 NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
@@ -264,7 +264,7 @@ def trilinear(
     lowest, weights, steps = corners(positions, resolution)
     if objects is not None:
         lowest = lowest + objects.reshape(-1) * resolution**3
-    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, compute_once(weights), steps)
+    out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, weights, steps)
     return out.reshape(*positions.shape[:-1], volume.shape[-1])
 
 
@@ -279,9 +279,8 @@ def corners(
     grid = clamp((positions + 1) * (0.5 * resolution) - 0.5, 0, resolution - 1)
     cell = jnp.clip(jnp.floor(grid), 0, max(resolution - 2, 0))
     upper = grid - jax.lax.stop_gradient(cell)
-    # rows as a matrix product, for the reason that `compute_once` gives; exact in float32 up to 256^3 voxels
-    strides = jnp.array([[1.0], [resolution], [resolution**2]])
-    lowest = jnp.matmul(cell.reshape(-1, 3), strides, precision="highest").astype(jnp.int32)[:, 0]
+    x, y, z = (cell[..., axis].reshape(-1).astype(jnp.int32) for axis in range(3))
+    lowest = row_at(x, y, z, resolution)
     places = list(itertools.product((0, 1), repeat=3))
     x, y, z = (jnp.stack([1 - upper[..., axis], upper[..., axis]]) for axis in range(3))
     weights = jnp.stack([jnp.where(inside, x[i] * y[j] * z[k], 0) for i, j, k in places], axis=-1)

@@ -2,7 +2,7 @@
 
     encode, render               batches of objects, in the box; pure
     loss                         loss of a training batch; pure
-    encode_volume, draw          one object, compiled: for the handle (model.py), scores and the viewer
+    encode_volume, draw_each     one object, compiled: for the handle (model.py), scores and the viewer
 
 The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
 Values sown into the collection "losses" are added to the loss.
@@ -149,29 +149,17 @@ def draw_each(
     lights: Sequence[Light | None],
     *,
     config: NetworkConfig,
-    quality: str,
-) -> Iterator[Rendering]:
-    """Views one after the other."""
-    del quality  # these networks have one
-    for view, light in zip(views, lights, strict=True):
-        yield draw(variables, volume, view, light, config=config)
-
-
-def draw(
-    variables: dict,
-    volume: Volume,
-    camera: Camera,
-    light: Light | None = None,
-    *,
-    config: NetworkConfig,
+    quality: str = "trained",
     options: RenderOptions | None = None,
-) -> Rendering:
-    """A view; UserError for a light, and for odd sizes of a network that doubles its pictures."""
-    if light is not None:
-        raise UserError("this network knows the light of its training alone; give no light")
-    if config.upsamples and (camera.height % 2 or camera.width % 2):
-        raise UserError(f"this network doubles its pictures: {camera.width} x {camera.height} pixels must be even")
-    return _render(variables, volume.scene, volume.centre, volume.scale, camera, config=config, options=options)
+) -> Iterator[Rendering]:
+    """Views one after the other; UserError for a light, and for odd sizes of a network that doubles its pictures."""
+    del quality  # these networks have one; others say in the options what theirs is
+    for view, light in zip(views, lights, strict=True):
+        if light is not None:
+            raise UserError("this network knows the light of its training alone; give no light")
+        if config.upsamples and (view.height % 2 or view.width % 2):
+            raise UserError(f"this network doubles its pictures: {view.width} x {view.height} pixels must be even")
+        yield _render(variables, volume.scene, volume.centre, volume.scale, view, config=config, options=options)
 
 
 # These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.

@@ -71,7 +71,6 @@ class Model:
         The paper's network looks near the points alone at `draft`, `balanced` and `best`, with a quarter, half and all
         of the samples of a ray, and renders as it was trained at `trained`.
         """
-        _check_quality(quality)
         if camera.cam_to_world.ndim == 2:
             return next(self.render_each(volume, [camera], quality, [light]))
         drawn = self.render_each(volume, unstack(camera), quality, [light] * len(camera.cam_to_world))

@@ -194,7 +194,7 @@ def _on_one_device(
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)
 
 
-def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]) -> Path:
+def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> Path:
     """The part of each ray that is sampled: what lies near points, or all that lies in the box."""
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
@@ -206,14 +206,7 @@ def _meets(
     near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]
 ) -> Bool[Array, " rays"]:
     """Whether there is anything to sample on each ray; paths are many numbers, so they are not kept."""
-    total = objects.size
-    size = min(total, LOOKED_AT)
-
-    def chunked(x):
-        return jnp.pad(x, ((0, -total % size), *[(0, 0)] * (x.ndim - 1)), mode="edge").reshape(-1, size, *x.shape[1:])
-
-    found = jax.lax.map(lambda x: _path(near_points, *x).travelled[:, -1] > 0, jax.tree.map(chunked, (rays, objects)))
-    return found.reshape(-1)[:total]
+    return jax.lax.map(lambda x: _path(near_points, *x).travelled[-1] > 0, (rays, objects), batch_size=LOOKED_AT)
 
 
 def places(rays: Rays, distances: Float[Array, "*rays samples"]) -> Float[Array, "*rays samples 3"]:
@@ -289,9 +282,8 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other, with the samples of a quality."""
-    draw = partial(inference.draw, variables, volume, config=config)
-    for view, light in zip(views, lights, strict=True):
-        yield draw(view, light, options=at_quality(config, quality, volume.reach))
+    options = at_quality(config, quality, volume.reach)
+    return inference.draw_each(variables, volume, views, lights, config=config, options=options)
 
 
 def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:

@@ -4,16 +4,14 @@ Layout is channels last: inputs (batch, *space, in), kernels (*window, in, out) 
 pad one voxel on every side, like the stride-1 ones (a SAME rule would pad the far side only).  On a GPU these are XLA's
 native convolutions.  On a CPU (measurements: docs/lab/cpu_forms.md):
   3D   a sum over depth taps of 2D convolutions, or one matrix product for tiny volumes
-  2D   native, except for matrix products for the gradients of 2-wide windows and the kernel gradients of 4-wide windows
-       and of few output features; one matrix product for 128 input features or more
+  2D   native, but for matrix products for the kernel gradients of 2-wide and 4-wide windows; one matrix product for
+       128 input features or more
 
 Normalisations are batch statistics over the real points of padded clouds, and groups of channels of one volume.
 """
 
 import itertools
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -22,9 +20,8 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.kernels.numerics import compute_once, per_feature
+from spnr_jax.kernels.numerics import per_feature
 
-FEW_FEATURES = 4  # of a convolution's output, for which XLA's gradient of the kernel is slow
 FEW_PIXELS = 2  # an axis, for which a kernel is larger than what it is folded for
 MANY_FEATURES = 128  # of its input, for which one matrix product is faster than a convolution
 
@@ -62,36 +59,6 @@ class Conv(nn.Module):
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
         y = conv(x, jnp.asarray(kernel))
         return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
-
-
-def run_by_run(function: Callable) -> Callable:
-    """The function of trees of arrays, without a gradient; under vmap a loop on a CPU, elsewhere vmap as it is.
-
-    A loss under vmap would have a kernel for each run: XLA's grouped convolutions take two to eight times as long.
-    """
-    single = jax.custom_batching.custom_vmap(function)
-
-    @single.def_vmap
-    def mapped(axis_size: int, in_batched: Any, *arguments: Any) -> tuple[Any, Any]:
-        del axis_size
-        leaves, tree = jax.tree.flatten(arguments)
-        batched = jax.tree.leaves(in_batched)
-        moving = [x for x, moves in zip(leaves, batched, strict=True) if moves]
-
-        def whole(parts: list) -> tuple:
-            rest = iter(parts)
-            return jax.tree.unflatten(
-                tree, [next(rest) if moves else x for x, moves in zip(leaves, batched, strict=True)]
-            )
-
-        out = lax.platform_dependent(
-            moving,
-            cpu=lambda parts: lax.map(lambda one: single(*whole(one)), parts),
-            default=jax.vmap(lambda one: function(*whole(one))),
-        )
-        return out, jax.tree.map(lambda _: True, out)
-
-    return single
 
 
 def _native(x, kernel, stride, padding):
@@ -145,8 +112,6 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
     `_kernel_gradient` 46 to 97.
     """
     window = kernel.shape[0]
-    if window == 2 and (stride, padding) == (1, 1):
-        return _input_gradient_of_pairs(x, kernel, cotangent)
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
     turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
@@ -154,19 +119,13 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
-    """The convolution of the input, features as pictures, with the cotangents as one large window; or products.
+    """The convolution of the input, features as pictures, with the cotangents as one large window.
 
-    With few output features the cotangents that every input pixel meets in the window are put side by side; for other
-    windows than of 3 there is one product per place in them.
+    For other windows than of 3 there is one product per place in them.
     """
-    window, (features_in, features_out) = kernel.shape[0], kernel.shape[2:]
-    if stride == 1 and features_out <= FEW_FEATURES:
-        met = list(_windows(_pad(cotangent, window - 1 - padding), window, 1))
-        columns = jnp.concatenate(met[::-1], axis=-1)
-        dk = x.reshape(-1, features_in).T @ columns.reshape(-1, window**2 * features_out)
-        return dk.reshape(features_in, window, window, features_out).transpose(1, 2, 0, 3)
-    if window != 3 or features_out <= FEW_FEATURES:
-        flat = cotangent.reshape(-1, features_out)
+    window = kernel.shape[0]
+    if window != 3:
+        flat = cotangent.reshape(-1, kernel.shape[-1])
         seen = _windows(_pad(x, padding), window, stride)
         return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen]).reshape(kernel.shape)
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
@@ -176,17 +135,8 @@ def _kernel_gradient(x, kernel, cotangent, stride, padding):
     return jnp.transpose(dk, (1, 2, 0, 3))
 
 
-def _input_gradient_of_pairs(x, kernel, cotangent):
-    """What each place of a window of 2 gives to its input, by one matrix product, and the sum of the four."""
-    height, width, features_in = x.shape[1:]
-    given = cotangent @ jnp.moveaxis(kernel, -1, 0).reshape(kernel.shape[-1], -1)
-    given = given.reshape(*cotangent.shape[:3], 2, 2, features_in)
-    return sum(given[:, 1 - i : 1 - i + height, 1 - j : 1 - j + width, i, j] for i in (0, 1) for j in (0, 1))
-
-
 def _conv2d_cpu(x, kernel, stride, padding):
-    features_in, features_out = kernel.shape[2:]
-    if features_in >= MANY_FEATURES and features_out > FEW_FEATURES:
+    if kernel.shape[-2] >= MANY_FEATURES:
         return _columns(x, kernel, stride, padding)
     return _conv2d(x, kernel, stride, padding)
 
@@ -295,59 +245,12 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "batch *space features"]) -> Float[Array, "batch *space features"]:
         """Normalised features, scaled and shifted per channel."""
-        shape = (x.shape[-1],)
-        scale = self.param("scale", nn.initializers.ones, shape)
-        bias = self.param("bias", nn.initializers.zeros, shape)
-        out = group_norm(x.reshape(x.shape[0], -1, x.shape[-1]), scale, bias, self.num_groups)
-        return out.reshape(x.shape)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(3,))
-def group_norm(
-    x: Float[Array, "batch places features"],
-    scale: Float[Array, " features"],
-    bias: Float[Array, " features"],
-    num_groups: int,
-) -> Float[Array, "batch places features"]:
-    """(x - mean) / sqrt(variance + 1e-5) * scale + bias, statistics over places and the channels of a group.
-
-    What belongs to a channel is computed once and not in every place, and the gradient is written out: a third of the
-    time of the plain form with its derived gradient on a CPU.
-    """
-    return _group_norm(x, scale, bias, num_groups)[0]
-
-
-def _group_norm(x, scale, bias, num_groups):
-    mean = compute_once(_group_mean(jnp.mean(x, axis=1), num_groups))
-    centred = x - mean[:, None]
-    inverse = compute_once(1 / jnp.sqrt(_group_mean(jnp.mean(jnp.square(centred), axis=1), num_groups) + EPSILON))
-    slope = compute_once(inverse * per_feature(scale, inverse))
-    return centred * slope[:, None] + per_feature(bias, x), (x, mean, inverse, scale)
-
-
-def _group_norm_backward(num_groups, residuals, cotangent):
-    """The gradient by x is slope * cotangent, less its part along a constant and along x in each group."""
-    x, mean, inverse, scale = residuals
-    scale, centred = per_feature(scale, inverse), x - mean[:, None]
-    shift_gradient = jnp.sum(cotangent, axis=1)
-    scale_gradient = _sum_of_places(cotangent * centred) * inverse
-    along_one, along_x = (_group_mean(g * scale, num_groups) / x.shape[1] for g in (shift_gradient, scale_gradient))
-    slope, constant, linear = (compute_once(v * inverse) for v in (scale, -along_one, -along_x * inverse))
-    gradient = cotangent * slope[:, None] + centred * linear[:, None] + constant[:, None]
-    return gradient, jnp.sum(scale_gradient, axis=0), jnp.sum(shift_gradient, axis=0)
-
-
-def _sum_of_places(x):
-    """Sum over axis 1; a single batch entry in two halves, because XLA's CPU loop over one is up to 70 times slower."""
-    if len(x) > 1 or x.shape[1] % 2:
-        return jnp.sum(x, axis=1)
-    return jnp.sum(jnp.sum(x.reshape(2, -1, x.shape[2]), axis=1), axis=0, keepdims=True)
-
-
-def _group_mean(per_channel, num_groups):
-    """Mean of the channels of each group, at every one of them."""
-    groups = per_channel.reshape(per_channel.shape[0], num_groups, -1)
-    return jnp.broadcast_to(jnp.mean(groups, axis=-1, keepdims=True), groups.shape).reshape(per_channel.shape)
-
-
-group_norm.defvjp(_group_norm, _group_norm_backward)
+        scale, bias = (
+            self.param(name, start, (x.shape[-1],))
+            for name, start in (("scale", nn.initializers.ones), ("bias", nn.initializers.zeros))
+        )
+        groups = x.reshape(x.shape[0], -1, self.num_groups, x.shape[-1] // self.num_groups)
+        centred = groups - jnp.mean(groups, axis=(1, 3), keepdims=True)
+        variance = jnp.mean(jnp.square(centred), axis=(1, 3), keepdims=True)
+        normalised = (centred / jnp.sqrt(variance + EPSILON)).reshape(x.shape)
+        return normalised * per_feature(scale, x) + per_feature(bias, x)

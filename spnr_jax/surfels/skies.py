@@ -19,8 +19,6 @@ from spnr_jax.surfels.lighting import Color, directions, light_of, solid_angles
 # --- the room ---------------------------------------------------------------------------------------------------------
 
 
-SCALE = 0.5917323  # by which a white diffuse sphere averages 0.6 linear, measured by `data_gen.render.light`
-
 ROOM_MIN = np.array([-3.2, -1.3, -2.7])  # metres; the object floats at the origin
 ROOM_MAX = np.array([3.2, 1.6, 2.7])
 AMBIENT = 1.1  # light that has bounced more than once, the same everywhere
@@ -46,11 +44,6 @@ def indoor_envmap(height: int = 128) -> np.ndarray:
     """Return the default map (height, 2 * height, 3): a furnished room with a window and lamps, unscaled."""
     fine = room_radiance(directions(2 * height))
     return fine.reshape(height, 2, 2 * height, 2, 3).mean(axis=(1, 3)).astype(np.float32)
-
-
-def make_room_light() -> Light:
-    """What the file of `lighting.room_light` holds, made anew."""
-    return light_of(SCALE * indoor_envmap())
 
 
 def room_radiance(directions: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@
 One step evaluates the loss of the method (`methods.Method.loss`) once.  The discriminator, of methods that have one, is
 updated on the pictures of that forward pass, and the generator on the gradient that the updated discriminator and the
 method's loss send back through it.  `adversarial` is static: without it the graph contains no discriminator.  All
-randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.  On a
-CPU the losses of several runs under vmap are computed one after the other.
+randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.
+The losses of several runs under vmap are computed one after the other.
 """
 
 import dataclasses
@@ -23,7 +23,6 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import AnyArray, Batch, Key
 from spnr_jax.methods import method_of
-from spnr_jax.nn.convolution import run_by_run
 
 Judge = tuple[dict, tuple]  # parameters and optimiser of the discriminator
 
@@ -198,7 +197,8 @@ def train_step(
     """State after one step of the network, and of the discriminator from the same forward; and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
     judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
-    gradient_of = run_by_run(jax.value_and_grad(partial(total_loss, config), has_aux=True))
+    # under vmap one run after the other: a kernel for each run would be a grouped convolution, slow in XLA
+    gradient_of = jax.custom_batching.sequential_vmap(jax.value_and_grad(partial(total_loss, config), has_aux=True))
     (loss, (metrics, batch_stats, judge)), gradient = gradient_of(
         state.generator, state.batch_stats, judge, batch, key, state.step
     )

@@ -11,6 +11,7 @@ from support.surfel_clouds import estimate
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.surfels import gaussians
 from spnr_jax.surfels.gaussians import C0, basis, coefficients, degree_of, half_turn_signs, rotations
+from spnr_jax.surfels.sides import spiral
 
 RADIUS, SIZE, MOST = 0.8, 48, 500
 PIXEL = 3 / (0.5 * SIZE / np.tan(np.deg2rad(20)))
@@ -39,12 +40,7 @@ def views():
 
 @functools.cache
 def surfels():
-    turn = np.pi * (1 + 5**0.5) * np.arange(600)
-    height = 1 - (2 * np.arange(600) + 1) / 600
-    around = np.sqrt(1 - height**2)
-    positions = RADIUS * np.stack([around * np.cos(turn), height, around * np.sin(turn)], axis=-1).astype(np.float32)
-    grey = np.full((600, 3), 0.5, np.float32)
-    return estimate(positions, grey, np.full(600, 0.5, np.float32), np.zeros(600, np.float32), positions / RADIUS)
+    return estimate(RADIUS * spiral(600), normals=spiral(600))
 
 
 @functools.cache

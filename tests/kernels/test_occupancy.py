@@ -58,19 +58,12 @@ class TestPath:
         grid = jnp.zeros((4, 4, 4), bool).at[2, 2].set(jnp.array(row))
         return open_path(grid, self.rays, self.near, self.far, num_cells=cells)
 
-    def test_open_length_is_that_of_the_open_voxels_between_near_and_far(self):
+    def test_open_length_is_that_of_open_voxels_and_places_jump_over_gaps_on_their_edge_before_them(self):
         path = self.path([True, False, True, True])  # open from 0 to 0.5 and from 1 to 2
         close(path.travelled[:, -1], np.array([1.5, 0.5, 0.0]))
         close(path.travelled[0], np.array([0, 0.25, 0.5, 0.5, 0.5, 0.75, 1, 1.25, 1.5]))
-
-    def test_places_lie_in_open_voxels_and_jump_over_gaps(self):
-        path = self.path([True, False, True, True])
-        at = jnp.array([[0.1, 0.49, 0.51, 0.7, 1.4, 1.5]] * 3)
-        close(distance_at(path, at)[0], np.array([0.1, 0.49, 1.01, 1.2, 1.9, 2.0]), atol=1e-6)
-
-    def test_a_place_on_the_edge_of_a_gap_lies_before_it(self):
-        path = self.path([True, False, True, False])  # open from 0 to 0.5 and from 1 to 1.5
-        close(distance_at(path, jnp.array([[0.5, 1.0]] * 3))[0], np.array([0.5, 1.5]), atol=1e-6)
+        at = jnp.array([[0.1, 0.49, 0.5, 0.51, 0.7, 1.4, 1.5]] * 3)
+        close(distance_at(path, at)[0], np.array([0.1, 0.49, 0.5, 1.01, 1.2, 1.9, 2.0]), atol=1e-6)
 
     def test_paths_have_no_gradient(self):
         def ends(far):

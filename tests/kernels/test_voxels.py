@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 from support import reference
-from support.laws import adjoint_law, close, numbers, same_bits
+from support.laws import close, numbers, same_bits
 
 from spnr_jax.kernels import voxels
 from spnr_jax.kernels.voxels import row_of, scatter_conv, scatter_mean, spread, trilinear
@@ -120,26 +120,8 @@ class TestScatterConv:
         )
         close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
 
-    def test_is_adjoint_to_its_gradient_in_points_and_kernel(self):
-        rows, values = spread(POSITIONS[0, 0], numbers(9, 12, 2), jnp.asarray(MASK[0, 0]), D)
-        adjoint_law(lambda v: scatter_conv(rows, v, self.kernel, D), values)
-        adjoint_law(lambda k: scatter_conv(rows, values, k, D), self.kernel)
-
-    def test_no_valid_point_gives_zeros(self):
-        assert (self.sparse(POSITIONS[0, 0], FEATURES[0, 0], jnp.zeros(12, bool), self.kernel) == 0).all()
-
 
 class TestTrilinear:
-    def test_the_gradient_by_the_volume_is_the_adjoint_splat(self):
-        positions, cotangent = np.asarray(POSITIONS[0, 0]), np.asarray(FEATURES[0, 0])
-        splat = np.zeros((D, D, D, 2))
-        for position, value in zip(positions, cotangent, strict=True):
-            for voxel, weight in reference.trilinear_taps(position, D):
-                splat[voxel] += weight * value
-        gradient = jax.jit(lambda c: jax.vjp(lambda v: trilinear(v, POSITIONS[0, 0]), VOLUME)[1](c)[0])(FEATURES[0, 0])
-        close(gradient, splat)
-        adjoint_law(lambda volume: trilinear(volume, POSITIONS[0, 0]), VOLUME)
-
     def test_is_continuous_across_cells_and_constant_within_half_a_voxel_of_the_border(self):
         along = jnp.stack([jnp.linspace(-1, 1, 2001), jnp.full(2001, 0.1), jnp.full(2001, -0.3)], axis=-1)
         values = np.asarray(lookup(VOLUME, along))

@@ -93,8 +93,6 @@ NUMBERS = (
     Law("one_minus_exp", numerics.one_minus_exp, lambda x: -np.expm1(-x),
         sizes("size", 1e-30, 15, lambda rng, v: (v * rng.uniform(0.5, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, signed=False),))),
-    Law("softplus", numerics.softplus, reference.softplus, usual(around_zero(6, 4)), (1,),
-        Extremes((extremes(6, high=36),)), agreement=1e-8),
     Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
         Extremes((vectors,))),
     Law("normalize", numerics.normalize, direction, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
@@ -103,10 +101,6 @@ NUMBERS = (
     Law("srgb_to_linear", imaging.srgb_to_linear, decode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, high=15),), rtol=1e-5)),
     Law("encode_direction", lambda d: encode_direction(d, 4), encoding(4), usual(around_zero(6, 3)), (1,)),
-    # ten frequencies of coordinates up to a thousand are off by less than a thousandth
-    Law("encode_direction, ten frequencies", lambda d: encode_direction(d, 10), encoding(10),
-        usual(lambda rng: (0.01 * rng.normal(size=(6, 3)),)),
-        extremes=Extremes((extremes(4, 3, high=3).map(lambda x: np.clip(x, -1e3, 1e3)),), atol=lambda x: 1e-3)),
 )
 # fmt: on
 
@@ -465,9 +459,6 @@ LOSSES = (
     Law("r1", r1, lambda x, k: 0.5 * np.mean(np.einsum("bhwc,hwc->b", x, k) ** 2 * np.sum(k**2)),
         sizes("size of the gradient", 1e-16, 1e16,
         lambda rng, v: (rng.uniform(0.5, 1, (2, 8, 8, 3)), v**0.5 * rng.uniform(0.05, 0.1, (8, 8, 3))))),
-    Law("r1 of a square", lambda image: losses.r1(lambda x: jnp.sum(x**2, axis=(1, 2, 3)), image),
-        lambda image: 2 * (image**2).sum((1, 2, 3)).mean(), usual(around_zero(2, 4, 4, 3)),
-        extremes=Extremes((extremes(2, 4, 4, 3, low=-15, high=17),), rtol=1e-5)),
     Law("area_downsample", lambda image: losses.area_downsample(image, 3),
         each(partial(reference.area_downsample, size=3), "(h,w,c)->(s,s,c)"), usual(around_zero(6, 5, 7, 2)), (3,),
         Extremes((extremes(5, 7, 3),), rtol=1e-5, atol=lambda image: 1e-6 * np.abs(image).max() + TINY),

@@ -114,14 +114,11 @@ def test_a_run_without_a_checkpoint_says_how_to_get_one(tmp_path):
 
 
 class TestQuality:
-    @pytest.mark.parametrize(("quality", "samples"), [("draft", 2), ("balanced", 4), ("best", 8)])
-    def test_a_quality_is_a_share_of_the_samples_near_the_points(self, quality, samples):
+    @pytest.mark.parametrize(("quality", "samples"), [("draft", 2), ("balanced", 4), ("best", 8), ("trained", None)])
+    def test_a_quality_is_a_share_of_the_samples_near_the_points_or_what_the_training_took(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
-        expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3)
-        assert paper_method.at_quality(config, quality, 3) == RenderOptions(sampling=expected)
-
-    def test_trained_takes_the_samples_of_the_training(self):
-        assert paper_method.at_quality(tiny_dataset.CONFIG.model, "trained", 3) is None
+        expected = samples and RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=3))
+        assert paper_method.at_quality(config, quality, 3) == expected
 
     def test_another_word_is_refused(self, handle):
         volume = handle.encode(example_cloud())

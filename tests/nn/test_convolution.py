@@ -11,7 +11,7 @@ from jax import lax
 from support import reference
 from support.laws import close, numbers, same_bits
 
-from spnr_jax.nn.convolution import Conv, conv, run_by_run, upsample_conv
+from spnr_jax.nn.convolution import Conv, conv, upsample_conv
 
 
 def native(x, kernel, stride=1, padding=1):
@@ -106,22 +106,6 @@ def test_no_gradient_has_axes_in_an_order_that_xla_puts_right_outside_of_loops_a
         program = jax.jit(gradient).lower(x, kernel).as_text()
         found = set(re.findall(r"dim_numbers = (.*?),\s*window", program))
         assert found == {"[b, 0, 1, f]x[0, 1, i, o]->[b, 0, 1, f]"}
-
-
-@pytest.mark.parametrize("kernels", [0, None], ids=["a kernel each", "one kernel"])
-def test_runs_are_the_loop_over_them_one_after_the_other(kernels):
-    x, kernel = numbers(12, 3, 2, 5, 5, 2), numbers(13, 3, 3, 3, 2, 5)
-
-    def run(x, kernel):
-        return value_and_gradients(conv, x, kernel)
-
-    program = jax.jit(jax.vmap(run_by_run(run), (0, kernels)))
-    given = kernel if kernels == 0 else kernel[0]
-    together = program(x, given)
-    for i in range(3):
-        close(jax.tree.map(lambda a, i=i: a[i], together), jax.jit(run)(x[i], kernel[i if kernels == 0 else 0]))
-    groups = re.findall(r"feature_group_count = (\d+)", program.lower(x, given).as_text())
-    assert set(groups) == {"1"}
 
 
 def test_the_layer_is_that_of_flax():

@@ -12,7 +12,6 @@ from spnr_jax.kernels.numerics import normalize
 from spnr_jax.nn.paper_layers import (
     BRIGHTNESS_AND_HUE,
     Discriminator,
-    PointNet,
     RadianceField,
     UNet3D,
     Upsampler,
@@ -20,16 +19,7 @@ from spnr_jax.nn.paper_layers import (
 )
 
 
-class TestPointNet:
-    def test_padding_touches_neither_real_points_nor_statistics(self):
-        x, mask = numbers(0, 2, 6, 5), jnp.ones((2, 6), bool).at[1, 4:].set(False)
-        module = PointNet(widths=(8, 4), num_features=3)
-        variables = jax.jit(module.init, static_argnums=3)(jax.random.key(0), x, mask, True)
-        train = jax.jit(lambda x: module.apply(variables, x, mask, True, mutable=["batch_stats"]))
-        (out, stats), (changed, changed_stats) = train(x), train(jnp.where(mask[..., None], x, 1e3))
-        close(np.asarray(changed)[np.asarray(mask)], np.asarray(out)[np.asarray(mask)], atol=1e-5)
-        close(changed_stats, stats)
-
+class TestMaterials:
     def test_spread_materials_part_brightness_from_hue_and_lose_nothing(self):
         grey = jnp.tile(jnp.linspace(0, 1, 5)[:, None], (1, 3))
         close(spread_out(grey)[:, 1:], np.zeros((5, 2)), atol=1e-5)
@@ -51,13 +41,6 @@ def unet():
 
 
 class TestUNet3D:
-    def test_objects_do_not_see_each_other(self, unet):
-        apply, variables = unet
-        other_rows = ROWS.at[0].set(ROWS[0, ::-1] // 2)
-        whole, other = (apply(variables, rows, VALUES) for rows in (ROWS, other_rows))
-        close(other[1], whole[1], atol=1e-5)
-        assert (other[0] != whole[0]).any()
-
     def test_without_its_decoder_the_stem_alone_reaches_the_output(self, unet):
         """Skips are additions: blocks of zeros add relu(bias) = 0 to what the stem sends across."""
         apply, variables = unet

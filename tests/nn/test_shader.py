@@ -36,28 +36,6 @@ class TestPicture:
         close(linear, color * (1 - metallic) * arriving + specular, rtol=1e-4)
         close(alpha, ((opacity + LEAST_ODDS) / (1 + 2 * LEAST_ODDS))[..., 0], rtol=1e-4)
 
-    def test_it_is_linear_in_the_light_whatever_the_outputs(self):
-        outputs, values = 0.3 * numbers(2, 1, 12, 12, NUM_OUTPUTS), maps()
-        outputs = outputs.at[..., 8:].multiply(0.1)
-        lights = [
-            (values.at[..., LIT].set(0.4 * numbers(s, 1, 6, 6, 9, low=0.2)), 0.1 * numbers(s, 1, 9, 3)) for s in (3, 4)
-        ]
-        both = values.at[..., LIT].set(lights[0][0][..., LIT] + 0.5 * lights[1][0][..., LIT])
-        (one, a), (other, _) = (drawn(outputs, *light, doublings=1) for light in lights)
-        total, alpha = drawn(outputs, both, lights[0][1] + 0.5 * lights[1][1], doublings=1)
-        unclipped = (np.asarray(total) < 0.99) & (np.asarray(one) > 1e-4) & (np.asarray(other) > 1e-4)
-        assert unclipped.mean() > 0.8
-        close(total[unclipped], (one + 0.5 * other)[unclipped], rtol=1e-3, atol=1e-5)
-        close(alpha, a)
-
-    def test_without_light_it_is_black_and_by_far_too_much_white(self):
-        outputs, values = numbers(5, 1, 6, 6, NUM_OUTPUTS, low=0.0), maps()
-        image, _ = picture(outputs, values.at[..., LIT].set(0), jnp.zeros((1, 9, 3)), 0)
-        assert np.all(np.asarray(image) == 0)
-        image, alpha = picture(outputs, values.at[..., LIT].set(1e6), jnp.zeros((1, 9, 3)).at[:, 0].set(1e6), 0)
-        assert np.all(np.asarray(image) == 1)
-        assert np.isfinite(np.asarray(alpha)).all()
-
     def test_each_output_does_what_its_name_says(self):
         values, ambient = maps(), numbers(6, 1, 9, 3, low=0.1, high=0.3)
         values = values.at[..., :3].set(0.5).at[..., 3].set(0)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import spnr_jax
+from support.surfel_clouds import cloud
 
 FILE = Path(__file__).with_name("golden.npz")
 SIZE, VIEW = 64, {"azimuth": 35.0, "elevation": 25.0}
@@ -21,13 +22,6 @@ def sequence(count: int) -> np.ndarray:
     return (0.5 + np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 3)) % 1
 
 
-def cloud_of(positions, base_color, roughness, metallic) -> spnr_jax.PointCloud:
-    """The columns in float32."""
-    columns = {"positions": positions, "base_color": base_color, "roughness": roughness, "metallic": metallic}
-    columns = {name: np.asarray(column, np.float32) for name, column in columns.items()}
-    return spnr_jax.PointCloud(**columns, mask=np.ones(len(positions), bool))
-
-
 def torus(count: int = 1000) -> spnr_jax.PointCloud:
     """A torus with stripes of two colours, rough ones and smooth ones."""
     around, along = 2 * np.pi * sequence(count).T
@@ -35,7 +29,7 @@ def torus(count: int = 1000) -> spnr_jax.PointCloud:
     positions = np.stack([radius * np.cos(around), 0.28 * np.sin(along), radius * np.sin(around)], axis=-1)
     striped = (np.floor(6 * around / np.pi) % 2)[:, None]
     colors = striped * [0.7, 0.12, 0.05] + (1 - striped) * [0.05, 0.2, 0.55]
-    return cloud_of(positions, colors, 0.25 + 0.5 * striped[:, 0], 0 * around)
+    return cloud(positions, base_color=colors, roughness=0.25 + 0.5 * striped[:, 0])
 
 
 def table(count: int = 1500) -> spnr_jax.PointCloud:
@@ -56,19 +50,19 @@ def table(count: int = 1500) -> spnr_jax.PointCloud:
         positions[i] = np.add(boxes[box][0], place * np.array(boxes[box][1]))
     top = (side < 6).astype(float)
     colors = top[:, None] * [0.35, 0.18, 0.08] + (1 - top[:, None]) * [0.6, 0.6, 0.62]
-    return cloud_of(positions, colors, 0.6 * top + 0.3 * (1 - top), 1 - top)
+    return cloud(positions, base_color=colors, roughness=0.6 * top + 0.3 * (1 - top), metallic=1 - top)
 
 
 CLOUDS = {"torus": torus, "table": table}
 
 
-def draw(cloud: str) -> np.ndarray:
+def draw(name: str) -> np.ndarray:
     """Colours and opacity (64, 64, 4) of the cloud as the network of the package draws it, in [0, 1]."""
     model = spnr_jax.load()
-    volume = model.encode(CLOUDS[cloud]())
+    volume = model.encode(CLOUDS[name]())
     rendering = model.render(volume, model.camera(volume, **VIEW, resolution=SIZE), "best")
     return np.clip(np.concatenate([rendering.image, rendering.acc[..., None]], axis=-1), 0, 1)
 
 
 if __name__ == "__main__":
-    np.savez_compressed(FILE, **{cloud: np.round(255 * draw(cloud)).astype(np.uint8) for cloud in CLOUDS})
+    np.savez_compressed(FILE, **{name: np.round(255 * draw(name)).astype(np.uint8) for name in CLOUDS})

@@ -161,15 +161,6 @@ def gradient_law(function, *arguments, rtol=1e-3):
         close(s, d, rtol=rtol, atol=rtol * np.abs(d).max() + 1e-12)
 
 
-def adjoint_law(linear, x):
-    """<A x, y> = <x, A^T y> to 1e-6 for a random y, summed in float64: a linear function and its gradient."""
-    out, transpose = jax.vjp(jax.jit(linear), x)
-    y = numbers(1, *out.shape)
-    (back,) = transpose(y)
-    out, x, y, back = map(np.float64, (out, x, y, back))
-    assert abs(np.vdot(out, y) - np.vdot(x, back)) <= 1e-6 * np.linalg.norm(out) * np.linalg.norm(y)
-
-
 KINDS = ("spread", "mixed", "equal", "ties", "one-hot", "zeros")
 TINY = 1e-37  # a float32 has all its digits above it
 hypotheses = settings(

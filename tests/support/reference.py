@@ -26,21 +26,6 @@ def box_interval(origin, direction, lo=-1.0, hi=1.0):
     return (near, far) if far > near else None
 
 
-def importance(edges, weights, at, padding):
-    """For each number in `at`: where the cumulative mass of the step function reaches that share of the whole."""
-    edges, mass = np.float64(edges), np.float64(weights) + padding
-    mass = mass / mass.sum()
-    distances = []
-    for share in np.float64(at):
-        before = 0.0
-        for i, m in enumerate(mass):
-            if share < before + m or i == len(mass) - 1:
-                distances.append(edges[i] + min((share - before) / m, 1.0) * (edges[i + 1] - edges[i]))
-                break
-            before += m
-    return np.array(distances)
-
-
 def volume_weights(density, delta):
     """(weights, residual transmittance): what is left of one unit of light after each interval in turn."""
     light, weights = 1.0, []

@@ -94,13 +94,6 @@ def test_a_normal_given_on_a_sheet_keeps_its_sign():
     close(estimate(positions, normals=-normals)["normal"], -normals, atol=1e-5)
 
 
-def test_normals_of_length_0_are_turned_as_those_that_are_estimated():
-    bowl = shape("sphere", 800)[0]
-    bowl = bowl[bowl[:, 1] < 0]  # both sides are seen alike: a given side would stand against most votes
-    without, empty = estimate(bowl)["normal"], estimate(bowl, normals=np.zeros_like(bowl))["normal"]
-    assert np.mean(np.sum(without * empty, axis=1) > 0.9) > 0.98
-
-
 def cube(count):
     """Points, normals and spacing of a cube of side 1."""
     u, v = 0.5 * even_square(count).T

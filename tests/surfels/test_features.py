@@ -76,16 +76,6 @@ def test_the_last_number_tells_a_texture_from_one_colour():
     assert 0.1 < np.asarray(other)[inside, -1].mean() <= 0.4 + 1e-3
 
 
-def test_maps_are_linear_in_the_light():
-    positions, normal, spacing = shape("sphere", 500)
-    found, view = surfels(positions, normal, spacing), camera(24)
-    lights = sky(), sky()[::-1].copy()
-    one, other, both = (drawn(found, light_of(x), view)[2] for x in (*lights, 2 * lights[0] + 3 * lights[1]))
-    assert one.shape == (24, 24, shader.NUM_MAPS)
-    close(both[..., 7:16], 2 * one[..., 7:16] + 3 * other[..., 7:16], rtol=1e-3, atol=1e-4)
-    close(both[..., :7], one[..., :7])
-
-
 def test_without_points_everything_is_finite_and_what_the_network_sees_is_0():
     found = surfels(np.float32([[0, 0, 9.0]] * 500), (0, 0, 1.0), 0.1)
     buffer, seen, maps = drawn(found, light_of(sky()), camera(24))

@@ -75,16 +75,6 @@ def test_normals_of_a_ball_point_away_from_its_middle_in_the_order_of_the_points
     np.testing.assert_allclose(normals_of(points, kept), spiral(count)[kept], atol=0.05)
 
 
-def test_both_sides_of_a_thin_plate_point_away_from_it():
-    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-1, 1, 45)]))
-    points = np.concatenate([np.stack([x, y, z + 0 * x], 1) for z in (0.0, 0.1)])
-    found = normals_of(points, np.arange(0, len(points), 11))
-    down = points[::11, 2] == 0
-    inner = np.abs(points[::11, :2]).max(axis=1) < 0.9
-    np.testing.assert_allclose(found[down & inner], [[0, 0, -1]] * np.sum(down & inner), atol=0.05)
-    np.testing.assert_allclose(found[~down & inner], [[0, 0, 1]] * np.sum(~down & inner), atol=0.05)
-
-
 @pytest.mark.parametrize("size", [1e-25, 1e25])
 def test_the_unit_of_length_does_not_matter(size):
     points = spiral(3000).astype(np.float64) * [1, 2, 0.5]
@@ -97,14 +87,6 @@ def test_points_that_coincide_have_some_normal_of_unit_length(count, monkeypatch
     monkeypatch.setattr(cloud_arrays, "SMALLEST_BUCKET", 4096)  # few programs
     found = normals_of(np.zeros((count, 3)), np.arange(min(count, 3)))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
-
-
-def test_noise_that_was_averaged_makes_the_neighbourhood_wider():
-    points, kept = spiral(4000).astype(np.float64), np.arange(0, 4000, 7)
-    noisy = points + np.random.default_rng(0).normal(size=points.shape) * 0.014
-    told, untold = (1 - np.sum(normals_of(noisy, kept, noise) * points[kept], axis=1) for noise in (0.085, 0.0))
-    assert np.quantile(told, 0.97) < 0.05
-    assert np.median(told) < 0.5 * np.median(untold)
 
 
 def test_thinned_points_keep_the_normals_of_their_file_and_else_get_those_of_all_points():

@@ -76,14 +76,6 @@ class TestShares:
         close(np.sum(share), -np.expm1(-np.sum(tau)), rtol=1e-5)
         close(left[6:12], np.full((6, 1), np.exp(-np.sum(tau[:6]))), rtol=1e-5)
 
-    def test_the_order_within_a_layer_does_not_matter(self):
-        depth = np.sort(3 + 0.04 * numbers(2, 9, 1), axis=0)
-        tau, order = np.asarray(numbers(3, 9, 1, low=0.0)), np.array([4, 7, 0, 1, 8, 3, 2, 6, 5])
-        spacing = jnp.full((9, 1), 0.1)
-        share, _ = shares(jnp.asarray(tau), jnp.asarray(depth), spacing)
-        other, _ = shares(jnp.asarray(tau[order]), jnp.asarray(depth), spacing)
-        close(other, np.asarray(share)[order], rtol=1e-5)
-
 
 class TestEntries:
     def test_they_are_all_pairs_of_a_float64_loop_over_discs_and_pixels_also_for_a_wide_view(self):
