@@ -4,7 +4,7 @@ One step evaluates the loss of the method (`methods.Method.loss`) once.  The dis
 updated on the pictures of that forward pass, and the generator on the gradient that the updated discriminator and the
 method's loss send back through it.  `adversarial` is static: without it the graph contains no discriminator.  All
 randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.
-The losses of several runs under vmap are computed one after the other.
+On a CPU the losses of several runs under vmap are computed one after the other.
 """
 
 import dataclasses
@@ -197,8 +197,9 @@ def train_step(
     """State after one step of the network, and of the discriminator from the same forward; and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
     judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
-    # under vmap one run after the other: a kernel for each run would be a grouped convolution, slow in XLA
-    gradient_of = jax.custom_batching.sequential_vmap(jax.value_and_grad(partial(total_loss, config), has_aux=True))
+    gradient_of = jax.value_and_grad(partial(total_loss, config), has_aux=True)
+    if jax.default_backend() == "cpu":  # under vmap a kernel for each run would be a grouped convolution, slow in XLA
+        gradient_of = jax.custom_batching.sequential_vmap(gradient_of)
     (loss, (metrics, batch_stats, judge)), gradient = gradient_of(
         state.generator, state.batch_stats, judge, batch, key, state.step
     )
