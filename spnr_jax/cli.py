@@ -153,7 +153,7 @@ def run_render(command: Render) -> None:
     faults = 0
     for cloud in (command.cloud, *command.others):
         try:
-            for line in render_file(dataclasses.replace(command, cloud=cloud), _make_note(cloud)):
+            for line in render_file(dataclasses.replace(command, cloud=cloud, others=()), _make_note(cloud)):
                 print(line, flush=True)
         except ValueError as error:
             if not command.others:

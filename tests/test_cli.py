@@ -41,7 +41,7 @@ def run():
 FILES = {
     "empty.ply": b"",
     "noise.npz": b"PK\x03\x04 no zip",
-    "cloud.doc": b"0 0 0\n",
+    "cloud.doc": b"\xd0\xcf\x11\xe0\x00\x00",
     "point.xyz": b"1 2 3\n",
     "three.xyz": b"1 2 3\n2 2 3\n1 3 3\n",
     "ball.xyz": "\n".join(f"{x} {y} {z}" for x, y, z in spiral(2000)).encode(),
@@ -192,8 +192,8 @@ def test_clouds_of_three_points_render_and_one_that_cannot_be_is_named_and_left_
     for cloud, name in zip(clouds, ("three.xyz", "point.xyz", "three.xyz"), strict=True):
         cloud.write_bytes(FILES[name])
     arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
-    assert exit_code("render", clouds[2], *arguments, "--turntable", "none") == 0
-    assert (out / "two_000.png").is_file()
+    assert exit_code("render", clouds[0], clouds[2], *arguments, "--turntable", "none") == 0
+    assert (out / "one_000.png").is_file() and (out / "two_000.png").is_file()
     shutil.rmtree(out)
     assert exit_code("render", *clouds[:2], *arguments) == 2
     assert {path.name for path in out.iterdir()} == {

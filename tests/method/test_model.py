@@ -122,9 +122,9 @@ class TestQuality:
 
     def test_another_word_is_refused(self, handle):
         volume = handle.encode(example_cloud())
-        unchecked = inspect.unwrap(model.Model.render)  # the tests' type check would refuse it first
+        unchecked = inspect.unwrap(model.Model.render_each)  # the tests' type check would refuse it first
         with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
-            unchecked(handle, volume, handle.camera(volume), "fast")
+            unchecked(handle, volume, [handle.camera(volume)], "fast")
 
     @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
     def test_every_quality_shows_the_object(self, handle, quality):
