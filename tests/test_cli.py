@@ -193,7 +193,7 @@ def test_clouds_of_three_points_render_and_one_that_cannot_be_is_named_and_left_
         cloud.write_bytes(FILES[name])
     arguments = ("--run", run, "--out", out, "--views", 1, "--frames", 2, "--resolution", 24)
     assert exit_code("render", clouds[0], clouds[2], *arguments, "--turntable", "none") == 0
-    assert (out / "one_000.png").is_file() and (out / "two_000.png").is_file()
+    assert {"one_000.png", "two_000.png"} <= {path.name for path in out.iterdir()}
     shutil.rmtree(out)
     assert exit_code("render", *clouds[:2], *arguments) == 2
     assert {path.name for path in out.iterdir()} == {

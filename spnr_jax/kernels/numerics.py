@@ -19,6 +19,13 @@ from jaxtyping import Array, Float, Shaped
 # --- numbers and vectors ----------------------------------------------------------------------------------------------
 
 
+# log1p(e) / e on [0, 1], highest power first: Chebyshev interpolation of degree 8, relative error 3e-8
+LOG1P = (
+    *(5.2534577954e-03, -2.9588507387e-02, 7.8361668009e-02, -1.3674769705e-01, 1.9111431080e-01),
+    *(-2.4844369892e-01, 3.3319271342e-01, -4.9999501517e-01, 9.9999997054e-01),
+)
+
+
 def safe_divide(numerator: Float[Array, "*batch"], denominator: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """numerator / denominator, and 0 where the denominator is 0; finite in value and gradient there.
 
@@ -26,6 +33,25 @@ def safe_divide(numerator: Float[Array, "*batch"], denominator: Float[Array, "*b
     """
     valid = denominator != 0
     return jnp.where(valid, numerator / jnp.where(valid, denominator, 1), 0)
+
+
+@jax.custom_jvp
+def softplus(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """log(1 + exp(x)), finite everywhere, relative error 2e-7; gradient a sigmoid.
+
+    log1p(e) of e = exp(-|x|) in (0, 1] is e times a polynomial: XLA's log1p on a CPU makes the error of a rendering's
+    gradient five times as large, and takes 2.5 times as long.
+    """
+    e = jnp.exp(-jnp.abs(x))
+    ratio = jnp.full_like(e, LOG1P[0])
+    for coefficient in LOG1P[1:]:
+        ratio = ratio * e + coefficient
+    return jnp.maximum(x, 0) + e * ratio
+
+
+@softplus.defjvp
+def _softplus_jvp(primals, tangents):
+    return softplus(*primals), jax.nn.sigmoid(*primals) * tangents[0]
 
 
 @jax.custom_jvp

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.config import EncoderConfig
 from spnr_jax.kernels import voxels
 from spnr_jax.kernels.imaging import WHITE, bilinear, linear_to_srgb
-from spnr_jax.kernels.numerics import per_feature
+from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.voxels import scatter_conv
 from spnr_jax.nn.convolution import BatchNorm, GroupNorm, conv, kernel_init, upsample_conv
@@ -208,10 +208,10 @@ class RadianceField(nn.Module):
     ) -> tuple[Float[Array, "*rays samples"], tuple[Array, Array]]:
         """Density, and what is emitted at each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
         # one long axis of samples: XLA's CPU gradient of a product that sums over several axes takes four times as long
-        hidden = nn.softplus(self.hidden(x.reshape(-1, x.shape[-1])))
+        hidden = softplus(self.hidden(x.reshape(-1, x.shape[-1])))
         out = self.head(hidden).reshape(*x.shape[:-1], 4)
         rgb = nn.sigmoid(out[..., 1:] + view[..., None, :3])
-        return nn.softplus(out[..., 0] - 1), (rgb, hidden.reshape(*x.shape[:-1], self.width))
+        return softplus(out[..., 0] - 1), (rgb, hidden.reshape(*x.shape[:-1], self.width))
 
     def finish(
         self, emitted: tuple[Array, Array], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]

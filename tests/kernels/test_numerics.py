@@ -1,10 +1,11 @@
-"""Clamping; the others are in the tables of laws."""
+"""Clamping, softplus; the others are in the tables of laws."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from support.laws import close
 
-from spnr_jax.kernels.numerics import clamp
+from spnr_jax.kernels.numerics import clamp, softplus
 
 
 class TestClamp:
@@ -14,3 +15,10 @@ class TestClamp:
         close(value, jnp.clip(x, -1, 1), rtol=0, atol=0)
         expected = [[0, 1, 0, 1, 1], [1, 0, 0, 0, 0], [0, 0, 1, 0, 0]]
         close(pull_back(jnp.ones(5)), tuple(jnp.array(row, jnp.float32) for row in expected))
+
+
+class TestSoftplus:
+    def test_its_second_derivative_is_that_of_log_one_plus_exp(self):
+        x = np.linspace(-3, 3, 7, dtype=np.float32)
+        second = jax.jit(jax.vmap(jax.grad(jax.grad(softplus))))(jnp.asarray(x))
+        close(second, 1 / (1 + np.exp(-x)) / (1 + np.exp(x)))

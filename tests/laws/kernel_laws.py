@@ -93,6 +93,8 @@ NUMBERS = (
     Law("one_minus_exp", numerics.one_minus_exp, lambda x: -np.expm1(-x),
         sizes("size", 1e-30, 15, lambda rng, v: (v * rng.uniform(0.5, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, signed=False),))),
+    Law("softplus", numerics.softplus, reference.softplus, usual(around_zero(6, 4)), (1,),
+        Extremes((extremes(6, high=36),)), agreement=1e-8),
     Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
         Extremes((vectors,))),
     Law("normalize", numerics.normalize, direction, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
