@@ -1,20 +1,20 @@
 """Surfels from points: the surface around each point, estimated by one pure program over given neighbors.
 
-neighbors   the nearest points of each point: topology, found once on the host by a k-d tree; data without a gradient
-spacing     side of the square that a point represents, from the neighbors on its own layer of the surface
-normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
-sided       1 where the votes decide which side is outside, 0 where both are equally visible (a sheet)
-border      of two colors, where one lies within a disc, and the jump beyond it (discs.py)
+neighbors   the nearest points of each point, found once on the host with a k-d tree; integers without a gradient
+spacing     side of the square that a point represents, from the neighbors on the same layer of the surface
+normal      given, or else that of the layer (layers.py); the outer side is found by votes (sides.py)
+sided       1 where the votes agree on the outer side, 0 where both sides are equally visible (a sheet)
+border      a straight border between two colors inside a disc, and the jump of color across it (discs.py)
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
 scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
-Points are processed in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
-arrays of all points, which are (columns, points) here.
+Points are processed in blocks, one after the other, so that a million fit into memory.  A block reads its neighbors
+from arrays of all points, which are (columns, points) in this file.
 
 Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
-are constants without a gradient: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or
-has another color, sides and flips of normals, and visibility from each direction.
+are constants without a gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a
+disc or has another color, sides and flips of normals, and visibility from each direction.
 """
 
 import dataclasses
@@ -36,11 +36,11 @@ from spnr_jax.surfels.sides import cell_of, grid_of, see_directions
 # --- neighbors, on the host -------------------------------------------------------------------------------------------
 
 
-BLOCK = 2**14  # points that are asked for at once
+BLOCK = 2**14  # points per query of the k-d tree
 
 
 def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
-    """Numbers of the 20 nearest points of each point, itself first; -1 where there are fewer, and of padding.
+    """Indices of the 20 nearest points of each point, itself first; -1 where there are fewer, and for padding.
 
     NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
     """
@@ -55,16 +55,16 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
 
 
 def nearest(positions: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 20"]:
-    """Numbers of the nearest of real points, -1 where there are fewer; each point is its own first neighbor."""
+    """Indices of the nearest points of real points, -1 where there are fewer; each point is its own first neighbor."""
     return _ask(cKDTree(positions), np.arange(len(positions)))
 
 
 def order_in_space(
     positions: Float[np.ndarray, "points 3"],
 ) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "points 20"]]:
-    """An order of the points in which close ones follow each other, and the neighbors of the points so ordered.
+    """An order of the points that keeps close points close in memory, and the neighbors of the points in that order.
 
-    Caches hold what a block of points that are so ordered gathers.
+    What a block of ordered points gathers fits into the cache.
     """
     tree = cKDTree(positions)
     order = tree.indices
@@ -75,14 +75,14 @@ def order_in_space(
 
 
 def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
-    """Neighbors of the tree's points of these numbers, -1 for none; a point comes first among those at its place."""
+    """Neighbors of the points with these indices, -1 for none; each point comes first, even among duplicates."""
     ranks = list(range(1, min(NEIGHBORS, tree.n) + 1))
     blocks = [asked[i : i + BLOCK] for i in range(0, len(asked), BLOCK)]
     found = np.concatenate([tree.query(tree.data[rows], ranks, workers=-1)[1].astype(np.int32) for rows in blocks])
     wrong = np.flatnonzero(found[:, 0] != asked)
     if len(wrong):
         own = found[wrong] == asked[wrong, None]
-        lost = ~own.any(axis=1)  # among too many at its place
+        lost = ~own.any(axis=1)  # the point is missing from its own list: it has too many duplicates
         own[lost, -1], found[wrong[lost], -1] = True, asked[wrong[lost]]
         found[wrong] = np.take_along_axis(found[wrong], np.argsort(~own, axis=1, kind="stable"), axis=1)
     return np.pad(found, [(0, 0), (0, NEIGHBORS - found.shape[1])], constant_values=-1)
@@ -92,9 +92,9 @@ def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "som
 
 
 class Points(NamedTuple):
-    """All points of a cloud as columns, zeros where they are padding, and the numbers of their neighbors.
+    """All points of a cloud as columns, zeros for padding, and the indices of their neighbors.
 
-    `given` says which came with a normal that has a side.
+    `given` says which points came with an oriented normal.
     """
 
     number: Int[Array, "k points"]
@@ -107,9 +107,9 @@ class Points(NamedTuple):
 def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rules: Rules = RULES) -> Surfels:
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
-    As many as points and in their order.  `mask` is False for padding.
+    One surfel per point, in the same order; `mask` is False for padding.
     `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  A given normal may have any
-    length; one of length 0 is none.
+    length; length 0 means that it is not given.
     """
     mask = jnp.asarray(cloud.mask)
 
