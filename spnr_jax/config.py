@@ -1,16 +1,16 @@
-"""Every number of a network, its training and its pictures as frozen dataclasses; `presets.py` has those of trainings.
+"""All numbers of networks, training and rendering, as frozen dataclasses; `presets.py` holds whole training configs.
 
-    EncoderConfig   points to a volume, with which the paper's network begins
+    EncoderConfig   points to a volume: the first part of the paper's network
     PaperConfig     the paper's network             method/paper_method.py
-    SurfelConfig    the network over surfels        method/surfel_method.py
-    TrainConfig     a training: one of these, losses, optimiser, batches
-    Schedule        what the training loop does beside training
-    RenderOptions   how a render is asked for
+    SurfelConfig    the surfel network              method/surfel_method.py
+    TrainConfig     a training run: network, losses, optimiser, batches
+    Schedule        how often the training loop logs, previews and saves
+    RenderOptions   sampling and memory of a rendering
     Cut             what is cut out of a scene before it is drawn
 
-Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
-ValueError when the config is made, with the field and what came.  Marks: [paper] stands in the supplement, the rest is
-our choice.
+Configs are hashable, so they can be static arguments of jit.  All numbers are finite and at least 0.  A wrong value
+raises ValueError when the config is made; the message names the field and the value.  Values marked [paper] are in the
+paper's supplement; the others are our choice.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""The presets: functions that return a TrainConfig, named as `spnr train --preset` takes them.
+"""The presets: functions that return a TrainConfig; `spnr train --preset` takes their names.
 
-The paper's network in its sizes and in smaller ones, then ours over surfels.  The network of the package was trained
-with the preset `surfels` (docs/model_card.md).
+First the paper's network in its published sizes and in smaller ones, then our surfel network.  The package's network
+was trained with the preset `surfels` (docs/model_card.md).
 """
 
 import dataclasses
