@@ -152,7 +152,7 @@ def include(source: Path | str) -> None:
 
 @contextmanager
 def _working_folder():
-    """Modules of the working folder are found, as `python` finds them and an installed command does not."""
+    """Makes modules of the working folder importable, as `python` does and an installed command does not."""
     sys.path.insert(0, str(Path.cwd()))
     try:
         yield
@@ -169,7 +169,7 @@ def _import_file(path: Path) -> None:
 
 
 def network(config: NetworkConfig) -> Any:
-    """The Linen module that a network's config describes; it is imported when it is first asked for."""
+    """The Linen module for a network's config; its code is imported at the first call."""
     made = method_of(config).network
     assert made is not None, f"{config.method} is no Linen module"
     return (later(made) if isinstance(made, str) else made)(config)
@@ -184,19 +184,19 @@ def method_of(config: NetworkConfig) -> Method:
 
 
 def label_of(name: str) -> str:
-    """What tables and pictures call a method."""
+    """The name of a method in tables and pictures."""
     return METHODS[name].label if name in METHODS and METHODS[name].label else name
 
 
 def to_dict(config: TrainConfig) -> dict:
-    """Nested plain dict of a training, with the method of its network and the file that brought it."""
+    """A training config as a nested dict, with the method of its network and the file that registered it."""
     values, source = dataclasses.asdict(config), method_of(config.model).source
     named = {"method": config.model.method} | ({"source": source} if source else {})
     return values | {"model": named | values["model"]}
 
 
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
-    """Training from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
+    """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
     kinds = types_of(kind)
     values = {name: value for name, value in values.items() if f"{path}{name}" != GONE}
     for name in values:
@@ -219,7 +219,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
 
 
 def _sizes(name: Any, source: Any, path: str) -> type[NetworkConfig]:
-    """Class of the config of a network that a file names; nothing is imported for it."""
+    """The config class of the network that a file names; nothing is imported for it."""
     if isinstance(name, str) and name in METHODS:
         return METHODS[name].config
     named = f"--methods {source}, or load(..., methods={source!r})" if source else "--methods and its file"

@@ -80,10 +80,10 @@ def tiny() -> TrainConfig:
 
 
 def surfels() -> TrainConfig:
-    """Our network over G-buffers of surfels, pictures of any size.  `spnr train --preset surfels DATA RUN`.
+    """Our surfel network, for pictures of any size.  `spnr train --preset surfels DATA RUN`.
 
-    DATA of `spnr-data generate` with --resolution 512 --points 65536.  Some hours on two CPU cores, the first of them
-    for the G-buffers, which take some 10 MB of disk a cloud.  Expected figures: docs/lab/surfels.md.
+    DATA is from `spnr-data generate --resolution 512 --points 65536`.  Some hours on two CPU cores, of which the first
+    are for the G-buffers, which take some 10 MB of disk per cloud.  Expected figures: docs/lab/surfels.md.
     """
     return TrainConfig(
         preset="surfels",
@@ -103,9 +103,9 @@ def surfels() -> TrainConfig:
 
 
 def surfels_tiny() -> TrainConfig:
-    """Ours, narrower, minutes on two CPU cores.  `spnr train --preset surfels_tiny DATA RUN`.
+    """Our surfel network, narrower; minutes on two CPU cores.  `spnr train --preset surfels_tiny DATA RUN`.
 
-    For pictures of 64 px: at that size nothing is doubled, so larger pictures are not learnt.
+    For pictures of 64 px: it is not trained to double a resolution, which larger pictures need.
     """
     return TrainConfig(
         preset="surfels_tiny",
@@ -122,4 +122,4 @@ def surfels_tiny() -> TrainConfig:
 
 PAPERS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
 PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*PAPERS, surfels, surfels_tiny)}
-"""By name; `methods.register` adds those of a method of one's own."""
+"""By name; `methods.register` adds the presets of your own methods."""
