@@ -235,7 +235,7 @@ def scatter_conv(
     """3^3 convolution (zero padding) of the volume that `values` sum to, computed from the occupied voxels only.
 
     The result equals a convolution of the scattered volume: each point adds its 27 products to the neighbours of its
-    voxel. With 1024 points 3 % of a 32^3 grid is occupied.
+    voxel.  With 1024 points 3 % of a 32^3 grid is occupied.
     """
     products = jnp.einsum("pf,tfo->pto", values, kernel.reshape(27, *kernel.shape[3:]), precision="highest")
     # the output at voxel v reads voxel v + n through tap n: a point contributes to its neighbours at -n

@@ -364,10 +364,10 @@ def find_spacings(
 def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
     """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
 
-    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, padding
-    included.  `params` are not used by surfels; the argument is there for networks that encode.  The result has the
-    same structure with and without normals.  Gradients also flow through the normalisation: a shift of all points moves
-    the scene's centre.  The docstring of `geometry.py` lists what has no gradient.
+    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, also in
+    padding.  Surfels do not use `params`; the argument is there for networks that encode.  The result has the same
+    structure with and without normals.  Gradients also flow through the normalisation: a shift of all points moves the
+    scene's centre.  The docstring of `geometry.py` lists what has no gradient.
     """
     del params
     inside, centre, scale = move_into_box(cloud)

@@ -231,7 +231,7 @@ def find_planes(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Fl
     """Unit normals: of the planes through the point and two of its nearest neighbors, the one with the largest support.
 
     The least-squares plane is a candidate, too.  So a point at an edge gets the plane of one face, not an average of
-    both. The choice of the plane is constant for gradients; its normal has a gradient.
+    both.  The choice of the plane is constant for gradients; its normal has a gradient.
     """
     weight = weigh_near(hood, spacing, rules)
     narrowest = find_narrowest(measure_covariance(hood, spacing, weight))

@@ -149,11 +149,9 @@ def vote_of_walls(
     given: Bool[Array, " block"],
     rules: Rules,
 ) -> Float[Array, " block"]:
-    """A lean from a parallel layer too close for visibility between the two: the sides of a wall face away from each
-    other.
+    """A lean from a parallel layer too close to be visible in between: the sides of a wall face away from each other.
 
-    A layer just below another, as under a sticker, is taken for the inner side of a wall; given normals tell them
-    apart.
+    A layer just below another, as under a sticker, is taken for a wall's inner side; given normals tell them apart.
     """
     cosine = along(normals, layer.normal)
     other = jnp.where(given[None], -cosine, jnp.abs(cosine)) > rules.parallel
