@@ -170,8 +170,7 @@ class Light:
     def turned(self, degrees: float | int | jax.Array) -> "Light":
         """The light rotated about the up axis: an azimuth (0 at +z, 90 at +x) increases by `degrees`.
 
-        Exact for multiples of a texel, 5.625 degrees; otherwise neighbouring texels are interpolated.  The angle may be
-        traced.
+        Exact for multiples of a texel, 5.625 degrees; otherwise texels are interpolated.  The angle may be traced.
         """
         xp = namespace(degrees)
         columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth

@@ -64,8 +64,7 @@ def importance(
     """Sorted distances inside the edges, distributed as the step function `weights + padding` (NeRF, section 5.2).
 
     Inverts the cumulative distribution at one number in each of num_samples strata.  With all-zero weights the samples
-    are evenly distributed.  No gradient: otherwise the coarse weights would be pulled towards whatever the fine samples
-    find.
+    are evenly distributed.  No gradient: it would pull the coarse weights towards whatever the fine samples find.
     """
     if weights.shape[-1] + 1 != edges.shape[-1]:
         raise UserError(f"importance: {edges.shape[-1]} edges have one weight less, got {weights.shape[-1]} weights")

@@ -74,8 +74,7 @@ def object_of(
 ) -> tuple[Int[np.ndarray, " left"], list[str]]:
     """Rows of the points that remain without the dominant plane and in the nth largest cluster (None: all); messages.
 
-    Messages give positions as positions + origin.  ValueError if there is no such plane, no other point, or no such
-    cluster.
+    Messages give positions as positions + origin.  ValueError without such a plane, another point, or such a cluster.
     """
     rows, lines = np.arange(len(positions)), []
     if remove_plane:

@@ -74,9 +74,7 @@ class Places(NamedTuple):
 
 
 class Children(NamedTuple):
-    """One child of each candidate: `offset` from its middle in its frame and scale, log odds that it exists, and
-    weights of the points around it in its materials.
-    """
+    """A child of each candidate: `offset` from its middle in its frame, log odds that it exists, material weights."""
 
     position: Float[Array, "m 3"]
     offset: Float[Array, "m 3"]
