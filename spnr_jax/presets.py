@@ -17,7 +17,7 @@ from spnr_jax.config import (
     TrainConfig,
 )
 
-PAPER = EncoderConfig(inputs="spread", num_groups=1)  # of the paper's network, with what lets it learn hues
+PAPER = EncoderConfig(inputs="spread", num_groups=1)  # paper's encoder, changed to learn hues
 SHADED = LossConfig(l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3)
 QUICK = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995)
 

@@ -1,21 +1,19 @@
 """Cleaning of scans: outliers are removed, noisy points are averaged; clean clouds are unchanged.
 
-    outliers    the mean distance of a point to its neighbours over the median of its neighbours' mean distances: the
-                idea of the local outlier factor (Breunig et al. 2000), so that smoothly varying density removes
-                nothing.  The limit is robust: a multiple of the median absolute deviation (MAD), and never below a
-                fixed ratio
-    noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
-                Rousseeuw 1984): at an edge or a thin wall, that is one of the faces, so that neither counts as noise.
-                The noise is that of a plane whose points would have these distances; in thick noise the neighbourhood
-                grows
-    averaging   each point is moved to its most likely true position, and then along the normal onto the plane of the
+    outliers    score: the mean distance of a point to its neighbours over the median of its neighbours' mean distances,
+                as in the local outlier factor (Breunig et al. 2000), so that smoothly varying density removes nothing.
+                The limit is robust: a multiple of the median absolute deviation (MAD), and never below a fixed ratio
+    noise       distance of the neighbours from the plane that most of them are close to (least quantile of squares,
+                Rousseeuw 1984).  At an edge or a thin wall, that plane is one of the faces, so neither counts as noise.
+                The noise is that of a noisy plane with the same distances.  In thick noise the neighbourhood grows
+    averaging   each point moves to its most likely true position, and then along the normal onto the plane of the
                 points around it (moving least squares, Alexa et al. 2001), within a radius that depends on the noise.
-                Points of similar colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not
-                merge.  Materials become the mean of those that then lie close.  The true position is given by Tweedie's
-                formula (Efron 2011), x + sigma^2 times the gradient of the logarithm of the density.  That gradient is
+                Only points of similar colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not
+                merge.  Materials become the mean over the points that are then close.  The true position is given by
+                Tweedie's formula (Efron 2011): x + sigma^2 times the gradient of the log density.  That gradient is
                 C^-1 (m - x), with mean m and covariance C of the points in a window around x (Hjort & Jones 1996).  A
-                plane becomes flat, a thin bar keeps its thickness
-    fringe      noise that remains in places with few points, beside places with many, is removed
+                plane becomes flat, and a thin bar keeps its thickness
+    fringe      remaining noise is removed where sparse points lie beside dense ones
 
 NumPy in, NumPy out, nearly linear in the number of points; the order of the points does not matter.
 """
@@ -52,7 +50,7 @@ NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise above which points a
 SAMPLE = 2048  # points at which the noise is measured
 PLANES = 48  # candidate planes, each through three neighbours
 HEIGHTS = 32  # neighbours whose heights above a plane are measured
-SHARE = 0.35  # of them that have to lie close to it
+SHARE = 0.35  # quantile of the heights that the best plane minimises
 FLATTEST = 0.25  # share of the places from which the noise is estimated: elsewhere edges and thin walls add to it
 NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)  # over the neighbourhood's radius
 THICKNESS = (0.0, 0.012, 0.024, 0.0355, 0.047, 0.0556, 0.0624, 0.0681, 0.0726, 0.0766, 0.0798, 0.0822, 0.0836)

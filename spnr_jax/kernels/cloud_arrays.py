@@ -78,11 +78,11 @@ def plain_cloud(
 
 
 Values = dict[str, np.ndarray]
-NEAR = 1e-3  # of the median spacing
-AROUND, SAMPLE = 128, 1024  # neighbours that tell the spacing, at so many points
-FEW = 8  # distinct points, of which a spacing says nothing
-PLACE = 1e-6  # of the extent: what lies closer is one place
-LINE = 1e-13  # of the variance along a line, that there may be across it
+NEAR = 1e-3  # times the median spacing
+AROUND, SAMPLE = 128, 1024  # neighbours that determine the spacing; points at which it is estimated
+FEW = 8  # distinct points: with fewer, the spacing is meaningless
+PLACE = 1e-6  # of the extent: closer points share one place
+LINE = 1e-13  # largest variance of a line across it, as a share of that along it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 

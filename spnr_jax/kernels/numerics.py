@@ -75,7 +75,7 @@ def namespace(*values: Any) -> ModuleType:
 
 
 def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
-    """The features as separate arrays; their gradients are stacked once, where those of slices are padded and added.
+    """The features as separate arrays; their gradients are stacked once (gradients of slices are padded and summed).
 
     For twenty columns, XLA's CPU compiler takes five times as long for the sum of the padded ones.
     """

@@ -176,7 +176,7 @@ class Light:
         columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
         part = columns - whole
-        # indices: jnp.roll is compiled anew for every whole number
+        # indices: jnp.roll would be compiled for every shift
         places = xp.arange(self.tables.shape[-2]) - whole.astype(int)
         near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)

@@ -96,7 +96,7 @@ def _thickness(tree: cKDTree) -> float:
 def find_visible(
     positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
 ) -> Bool[np.ndarray, " points"]:
-    """True for points that no other hides from the place: the first in each pixel, and up to so many spacings behind.
+    """True for points visible from the place: the first in each pixel, and others up to `behind` spacings behind it.
 
     The sensor looks at the middle of the points; its pixels are CELL spacings wide there.
     """
