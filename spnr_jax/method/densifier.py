@@ -48,7 +48,7 @@ LIKELY = 0.55  # probability above which a child is kept
 
 
 class Nodes(NamedTuple):
-    """Nodes of the graph: `color` is the square root of the linear colour; `traits`: shape, sidedness, openness."""
+    """Graph nodes: `color` is the square root of the linear colour; `traits`: shape, sidedness, openness, mask."""
 
     position: Float[Array, "n 3"]
     normal: Float[Array, "n 3"]

@@ -19,10 +19,10 @@ from spnr_jax.surfels import geometry
 from spnr_jax.surfels.geometry import Points, order_in_space
 
 NEIGHBOURS = 16  # of a point, for the spacing
-REACH = 2.0  # standard deviation of a neighbour's weight by distance: in spacings, or in those of the noise
-DISCS = 2.5  # radius of the neighbourhood over that standard deviation, at most
+REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance
+DISCS = 2.5  # times the points in a disc of that radius: number of neighbours
 MOST = 128  # neighbours at most
-THICK = 0.15, 0.7  # standard deviation of the weight by height above the plane: in spacings, in those of the noise
+THICK = 0.15, 0.7  # standard deviation of the weight by height: the larger of these spacings and noise deviations
 FLAT, ROUGH = 32, 4.0  # neighbours from whose thickness a sensor's noise is estimated; factor on that thickness
 ROUNDS = 3  # of robust reweighting
 ROWS = 2**12  # points per block: their neighbours fit into the cache

@@ -2,8 +2,8 @@
 
     entry       a pair of a disc and a pixel that it covers; entries are counted, created, and sorted by pixel and depth
     kernel      1 - r^2, r being the distance from the disc's centre in its plane, over RADIUS spacings; a disc viewed
-                edge-on or smaller than a pixel is FLOOR pixels wide (the low-pass filter of EWA splatting, Zwicker et
-                al. 2001); an entry's optical depth is proportional to the square of the kernel
+                edge-on or smaller than a pixel has a radius of FLOOR pixels (low-pass filter of EWA splatting, Zwicker
+                et al. 2001); an entry's optical depth is proportional to the square of the kernel
     layers      of a pixel's LIST front-most entries, those less than a spacing apart in depth blend and do not occlude
                 each other; from two spacings on, the front entry occludes the one behind
     share       blend weight of an entry in its pixel: the shares of a layer add up to 1 - exp(-optical depth), times
