@@ -1,6 +1,6 @@
-"""Sparse-point neural rendering: a thousand surface points with materials in, pictures of the object out.
+"""Sparse-point neural rendering: about a thousand surface points with materials in, pictures of the object out.
 
-`import spnr_jax` loads nothing of JAX: what stands here is imported when it is first asked for.
+`import spnr_jax` does not import JAX: each public name is imported at its first use.
 """
 
 import warnings
@@ -20,13 +20,13 @@ _PUBLIC |= dict.fromkeys(
 )
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")
 
-WRONG = {"0.10.2": "jax-ml/jax#39103"}  # releases of jaxlib that compute wrong numbers, and who says so
+WRONG = {"0.10.2": "jax-ml/jax#39103"}  # versions of jaxlib that compute wrong numbers -> the issue
 
 __all__ = sorted(_PUBLIC)
 
 
 def warn_of_wrong_numbers() -> None:
-    """Warns, in one line, of an installed jaxlib that is known to compute wrong numbers."""
+    """Warns, in one line, if the installed jaxlib is known to compute wrong numbers."""
     found = version.__version__
     if found in WRONG:
         line = f"jaxlib {found} computes wrong numbers on a CPU ({WRONG[found]}): pip install 'jax!={found}'"
@@ -37,7 +37,7 @@ warn_of_wrong_numbers()
 
 
 def __getattr__(name: str):
-    """Loads a public name, or one of the kernel modules, on first use, so that importing the package stays quick."""
+    """Imports a public name or a kernel module at its first use, so that importing the package is fast."""
     if name in _KERNELS:
         return import_module(f"spnr_jax.kernels.{name}")
     if name not in _PUBLIC:

@@ -1,16 +1,16 @@
-"""Every number of a network, its training and its pictures as frozen dataclasses; `presets.py` has those of trainings.
+"""All numbers of networks, training and rendering, as frozen dataclasses; `presets.py` holds whole training configs.
 
-    EncoderConfig   points to a volume, with which the paper's network begins
+    EncoderConfig   points to a volume: the first part of the paper's network
     PaperConfig     the paper's network             method/paper_method.py
-    SurfelConfig    the network over surfels        method/surfel_method.py
-    TrainConfig     a training: one of these, losses, optimiser, batches
-    Schedule        what the training loop does beside training
-    RenderOptions   how a render is asked for
+    SurfelConfig    the surfel network              method/surfel_method.py
+    TrainConfig     a training run: network, losses, optimiser, batches
+    Schedule        how often the training loop logs, previews and saves
+    RenderOptions   sampling and memory of a rendering
     Cut             what is cut out of a scene before it is drawn
 
-Configs are hashable, so they are static arguments of jit.  All numbers are finite and at least 0; a wrong value raises
-ValueError when the config is made, with the field and what came.  Marks: [paper] stands in the supplement, the rest is
-our choice.
+Configs are hashable, so they can be static arguments of jit.  All numbers are finite and at least 0.  A wrong value
+raises ValueError when the config is made; the message names the field and the value.  Values marked [paper] are in the
+paper's supplement; the others are our choice.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ LARGEST = 2**63  # of any number in a config
 
 
 def check(config: Any, positive: Collection[str] = (), shares: Collection[str] = ()) -> None:
-    """ValueError for the first field that is not of its type, 0 where it must be positive, or a share above 1."""
+    """ValueError for the first field that has the wrong type, is 0 but must be positive, or is a share above 1."""
     of: Any = type(config)
     for name, kind in types_of(of).items():
         value = getattr(config, name)
@@ -51,7 +51,7 @@ def types_of(kind: Any) -> dict[str, Any]:
 
 
 def mismatch(value: Any, kind: Any) -> str:
-    """What a value should have been by its type; nothing if it is that.  A whole number will do for a float."""
+    """What the value should have been, by its type; empty if it fits.  An integer fits a float."""
     origin, inside = get_origin(kind), get_args(kind)
     if origin is Literal:
         return "" if isinstance(value, str) and value in inside else " or ".join([", ".join(inside[:-1]), inside[-1]])
@@ -72,11 +72,11 @@ class SamplingConfig:
     num_coarse: int = 64
     """Stratified samples between entry into and exit from the box [paper]."""
     num_fine: int = 64
-    """Samples drawn where the coarse weights are large [paper]; 0 renders the coarse samples alone."""
+    """Samples drawn where the coarse weights are large [paper]; 0: coarse samples only."""
     padding: float = 1e-5
-    """Added to each coarse weight before sampling: empty rays are sampled evenly, thin parts keep nearly all."""
+    """Added to each coarse weight: empty rays are sampled evenly, thin parts keep nearly all samples."""
     reach: int = 0
-    """Samples lie within so many voxels of a voxel with a point, and density is 0 elsewhere; 0: all the box [paper]."""
+    """Samples lie within this many voxels of a voxel with a point; density is 0 elsewhere.  0: whole box [paper]."""
 
     def __post_init__(self) -> None:
         check(self, positive=("num_coarse", "padding"))
@@ -84,12 +84,12 @@ class SamplingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """Rendering options of a ray-marching network; sizes and weights stay as they are."""
+    """Rendering options of a ray-marching network; its sizes and weights do not change."""
 
     sampling: SamplingConfig | None = None
     """Samples per ray; None: as in training."""
     block: int | None = None
-    """Rays rendered at once, which bounds the memory; None: as many as suit a picture of the network."""
+    """Rays rendered at once, which bounds the memory; None: a default that suits the network."""
 
 
 AS_TRAINED = RenderOptions()
@@ -97,12 +97,12 @@ AS_TRAINED = RenderOptions()
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """Sizes of PointNet and 3D U-Net, which make a volume of points (`nn/paper_layers.py`)."""
+    """Sizes of PointNet and 3D U-Net, which encode points to a volume (`nn/paper_layers.py`)."""
 
     materials: tuple[Material, ...] = ("base_color", "roughness", "metallic")
-    """Material channels that the points carry into the network."""
+    """Material channels of the points that the network receives."""
     inputs: Literal["plain", "spread"] = "plain"
-    """Materials as they are, or spread: sRGB as brightness and hue, each channel around 0 with a spread near 1."""
+    """Materials unchanged, or "spread": sRGB as brightness and hue, each channel centred at 0 with a spread near 1."""
     point_widths: tuple[int, ...] = (64, 128, 256)
     """Hidden layers of the PointNet [paper]."""
     point_features: int = 32
@@ -136,38 +136,38 @@ class EncoderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """Sizes that every network has."""
+    """Sizes that all networks have."""
 
     method: ClassVar[str] = "none"
-    """What the network is, for files and tables."""
+    """Name of the method, for files and tables."""
     qualities: ClassVar[tuple[Quality, ...]] = ("best",)
-    """Levels of quality at which its pictures differ, the best first."""
+    """Quality levels at which its pictures differ, the best first."""
     has_discriminator: ClassVar[bool] = False
     """Whether its loss may be adversarial."""
     crops: ClassVar[bool] = False
-    """Whether it is trained on squares of views."""
+    """Whether it is trained on crops of views."""
     ray_block: ClassVar[int | None] = None
-    """Rays rendered at once where no other number is asked for; None: the network's own."""
+    """Default number of rays rendered at once; None: the network's own."""
 
     image_resolution: int = 128
-    """Pixels along each side of the pictures of the training."""
+    """Pixels along each side of a training picture."""
 
     def __post_init__(self) -> None:
         check(self, positive=("image_resolution",))
 
     @property
     def upsamples(self) -> bool:
-        """Whether what is rendered along rays is smaller than the image."""
+        """Whether the volume rendering is smaller than the image."""
         return False
 
     @property
     def per_pixel(self) -> bool:
-        """Whether a pixel does not depend on its neighbours, so that a lattice of them can be trained on."""
+        """Whether pixels are independent of their neighbours, so that it can be trained on a lattice of them."""
         return False
 
     @property
     def any_size(self) -> bool:
-        """Whether pictures of any size can be rendered: an upsampler has learnt one."""
+        """Whether it can render pictures of any size; an upsampler has learnt one size."""
         return not self.upsamples
 
 
@@ -185,11 +185,11 @@ class PaperConfig(NetworkConfig):
     field_width: int = 64
     """Hidden layer of the radiance field."""
     direction_frequencies: int = 4
-    """Frequencies of the view direction's encoding; 0 gives the field the bare direction."""
+    """Frequencies of the view direction's encoding; 0 passes the direction itself."""
     sees_direction: bool = True
     """Whether colour and features depend on the view direction."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Format of the convolutions in U-Net, upsampler, discriminator; all else, parameters too, is float32."""
+    """Precision of the convolutions in U-Net, upsampler, discriminator; all else, parameters included, is float32."""
     num_features: int = 32
     """Channels of the rendered feature image; the first three are RGB."""
     render_resolution: int = 64
@@ -227,16 +227,16 @@ class PaperConfig(NetworkConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SurfelConfig(NetworkConfig):
-    """Our network over the G-buffer of surfels (`method/surfel_method.py`)."""
+    """Sizes of our surfel network (`method/surfel_method.py`)."""
 
     method: ClassVar[str] = "surfels"
     qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
     crops: ClassVar[bool] = True
 
     image_resolution: int = 512
-    """Pixels along each side of a picture where no other size is asked for."""
+    """Pixels along each side of a picture, by default."""
     widths: tuple[int, ...] = (24, 48, 96, 160)
-    """Features of the U-Net's levels, at the resolution of the points first."""
+    """Features of the U-Net's levels, from the G-buffer's resolution downwards."""
     top: int = 24
     """Features of the blocks that double the resolution."""
 
@@ -265,17 +265,17 @@ class LossConfig:
     discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
     pixel: Literal["l1", "mse"] = "l1"
-    """Error of a pixel; the weights named l1 apply to either."""
+    """Error per pixel; the weights named l1 apply to either."""
     masked: bool = False
-    """Leave pixels of opacity 0 out of the pixel error: Point-NeRF's rays without a point in reach."""
+    """Exclude pixels of opacity 0 from the pixel error: Point-NeRF's rays without a point in reach."""
     opacity_l1_weight: float = 0.0
-    """L1 of the opacity against the reference's."""
+    """L1 between the opacity and the reference's."""
     opacity_weight: float = 0.0
-    """Mean squared error of the opacity against the reference's, beside the loss of the picture."""
+    """Mean squared error between the opacity and the reference's, added to the loss of the image."""
     mse_weight: float = 0.0
-    """Mean squared error of the picture, in addition; where L1 is flat, as at outlines, it prefers the mean."""
+    """Mean squared error of the image, added; where L1 is flat, as at outlines, it prefers the mean."""
     condition: bool = True
-    """Whether the discriminator sees the true colours at visible input points [paper]; else an empty image and mask."""
+    """Whether the discriminator gets the true colours at visible input points [paper]; else an empty image and mask."""
 
     def __post_init__(self) -> None:
         check(self, positive=("r1_interval", "discriminator_width"), shares=("adversarial_start",))
@@ -283,7 +283,7 @@ class LossConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
-    """Adam for both networks, linear warm-up, cosine decay, average of the generator's weights."""
+    """Adam for both networks, linear warm-up, cosine decay, moving average of the generator's weights."""
 
     lr_generator: float = 5e-4
     """Peak learning rate of the generator."""
@@ -300,13 +300,13 @@ class OptimizerConfig:
     final_lr_scale: float = 0.01
     """Learning rate of the last step relative to the peak."""
     ema_decay: float = 0.999
-    """Decay per step of the averaged generator, which evaluation uses; ramps up from 0 in the first steps."""
+    """Decay per step of the averaged weights that evaluation uses; ramps up from 0 in the first steps."""
     algorithm: Literal["adam", "radam"] = "adam"
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = "cosine"
     """How the generator's learning rate falls after the warm-up."""
     clip_norm: float = 0.0
-    """Norm to which the generator's gradient is shortened where it is longer; 0: never."""
+    """Largest norm of the generator's gradient; longer gradients are scaled down.  0: no limit."""
 
     def __post_init__(self) -> None:
         decays = "beta1", "beta1_discriminator", "beta2", "ema_decay"
@@ -320,7 +320,7 @@ class TrainConfig:
     """A whole training run."""
 
     preset: str = "abo"
-    """Preset that this config started from; kept with the run."""
+    """Preset that this config started from; stored with the run."""
     model: NetworkConfig = field(default_factory=PaperConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -329,11 +329,11 @@ class TrainConfig:
     batch_objects: int = 8
     """Objects per step."""
     views_per_object: int = 1
-    """Views per object and step; they share one encoded volume."""
+    """Views per object and step; they share one encoding."""
     min_points: int = 512
-    """Fewest points drawn per object and step."""
+    """Fewest points of a cloud in a training step."""
     max_points: int = 4096
-    """Most points drawn per object and step; the padded size of the cloud."""
+    """Most points of a cloud in a training step; clouds are padded to it."""
     test_points: int = 1024
     """Points per object in evaluation."""
     seed: int = 0
@@ -341,10 +341,10 @@ class TrainConfig:
     pixel_stride: int = 1
     """Train on every n-th row and column of a view, at a random offset."""
     crop: int = 0
-    """Pixels along each side of the square of a view that is rendered in training, at a random place; 0: all of it."""
+    """Pixels along each side of the random crop of a view that is rendered in training; 0: the whole view."""
     even_share: float = 0.0
-    """Share of the clouds that are spread evenly (farthest-point sampling), not at random: an object's first points in
-    a data set of `--spread even`, farthest points of it where the network sees G-buffers."""
+    """Share of the clouds that are farthest-point sampled instead of random.  They are the first points of an object in
+    a data set with `--spread even`; for the surfel network, farthest points of it."""
 
     def __post_init__(self) -> None:
         counts = "num_steps", "batch_objects", "views_per_object", "min_points", "max_points", "test_points"
@@ -376,7 +376,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How often the loop does what is not training, in steps."""
+    """Intervals of logging, previews and checkpoints, in steps."""
 
     log_every: int = 20
     """Steps between rows of metrics.jsonl and TensorBoard."""
@@ -391,17 +391,17 @@ class Schedule:
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
-    """One object of a scene: inside a box, without the dominant plane, one cluster of points, in this order."""
+    """One object of a scene: inside a box, without the dominant plane, one cluster of points, applied in this order."""
 
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Only what lies in this box: xmin ymin zmin xmax ymax zmax, in the file's own units and axes."""
+    """Keep only points in this box: xmin ymin zmin xmax ymax zmax, in the file's own units and axes."""
     remove_plane: bool = False
-    """Without the plane that holds most of the surface: floor, table or wall."""
+    """Remove the plane that holds most of the surface: floor, table or wall."""
     object: str | None = None
-    """Only one cluster of points: `largest`, or 2 for the second largest, and so on, after the plane is removed."""
+    """Keep only one cluster of points, after the plane is removed: `largest`, or 2 for the second largest, etc."""
 
     keep_noise: bool = False
-    """Also points that a scan's classification calls noise (7, 18), withheld ones, and those of next to no opacity."""
+    """Keep also points of LAS class 7 or 18 (noise), withheld points, and points with opacity near 0."""
 
     @property
     def is_given(self) -> bool:
@@ -410,11 +410,11 @@ class Cut:
 
     @property
     def nth(self) -> int | None:
-        """Which cluster, the largest is 1; None for all."""
+        """Rank of the cluster, 1 for the largest; None: all clusters."""
         return None if self.object is None else 1 if self.object == "largest" else int(self.object)
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
+        """ValueError that names the invalid option."""
         if self.object not in (None, "largest") and not (self.object.isdecimal() and int(self.object) > 0):
             raise UserError(f"--object must be largest or a number from 1, got {self.object!r}")
         if self.crop is None:

@@ -1,12 +1,12 @@
-"""The methods that there are, by name, and trainings as JSON, in which `model.method` names one of them.
+"""The registry of methods (each a network with its functions), and training configs as JSON.
 
-A file of one's own adds a method, and its presets to those of `spnr train --preset`:
+Your own file can add a method, and with it presets for `spnr train --preset`:
 
     register(Method(config=MyConfig, network=MyNetwork, presets=(mine_tiny,), label="Mine"))
 
-`spnr train DATA RUN --methods my_method.py --preset mine_tiny` reads that file; so do `spnr evaluate` and the others
-with `--methods`, and `spnr_jax.load(RUN, methods="my_method.py")`.  Runs and files of weights keep the file's name, but
-no code is imported because they say so.
+`spnr train DATA RUN --methods my_method.py --preset mine_tiny` imports that file.  So do `spnr evaluate` and the other
+commands with `--methods`, and `spnr_jax.load(RUN, methods="my_method.py")`.  Runs and weights files store the file's
+name, but code is imported only if you name it.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ Function = Callable[..., Any]
 
 
 def later(place: str) -> Function:
-    """The function at "package.module:name"; its module is imported when it is first called."""
+    """A function that imports "package.module:name" when it is first called, and calls it."""
     module, _, name = place.partition(":")
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -38,50 +38,50 @@ def later(place: str) -> Function:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """A record of functions: all that training, `load`, evaluation, the commands and the viewer know of a network.
+    """A record of functions: all that training, `load`, evaluation, the commands and the viewer use of a network.
 
-    Those that are not given are of a Linen module, `network` (`method/inference.py`).
+    Functions that are not given default to those for a Linen module, `network` (`method/inference.py`).
     """
 
     config: type[NetworkConfig]
-    """Its sizes; their `method` is its name."""
+    """The config class of the network; its `method` is the name of the method."""
     network: str | Function | None = None
-    """Of sizes a Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and
-    `__call__(cloud, camera, key, train)`, or its place as "package.module:Name"; what it sows into "losses" is added to
-    the loss of a training."""
+    """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud,
+    camera, key, train)`; or its location as "package.module:Name".  Values that it sows into "losses" are added to the
+    loss."""
     init: Function = later("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
     encode: Function = later("spnr_jax.method.inference:encode_volume")
     """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
     render: Function = later("spnr_jax.method.inference:draw_each")
-    """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one a view."""
+    """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
     prepare: Function = later("spnr_jax.training.batching:prepare")
-    """(config, dataset, run, *, light) -> function of a step that gives the batches from there on."""
+    """(config, dataset, run, *, light) -> function (first step) -> iterator of batches."""
     loss: Function = later("spnr_jax.method.inference:loss")
-    """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the first argument's params."""
+    """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the params in `variables`."""
     discriminator: Function | None = None
-    """(config) -> Linen module (image, condition, mask) -> logits, if its loss may have one."""
+    """(config) -> Linen module (image, condition, mask) -> logits, for a loss with a discriminator."""
     takes_light: bool = False
-    """Whether pictures are drawn in any light; the others know the light of their training alone."""
+    """Whether the light is an input; other networks know only the light that they were trained with."""
     companions: tuple[str, ...] = ()
-    """Networks of the package whose weights lie beside its own in the variables, under their names."""
+    """Names of other networks of the package whose weights are stored in the variables, under these names."""
     presets: tuple[Callable[[], TrainConfig], ...] = ()
-    """Trainings of it, each named as its function."""
+    """Functions that return training configs; a preset has the name of its function."""
     label: str = ""
     """Its name in tables and pictures."""
     source: str = ""
-    """The file or module that brought it; empty for those of the package."""
+    """The file or module that registered it; empty for the package's methods."""
 
 
 class Outcome(NamedTuple):
-    """What a loss gives beside its value.
+    """What a loss returns beside its value.
 
-    The pictures (objects, views, ...) and the batch that they are compared with are for a discriminator alone.
+    The image (objects, views, ...) and the batch that it is compared with are only for a discriminator.
     """
 
     metrics: dict[str, Any]
     statistics: dict | None = None
-    """Running statistics with those of the batch; None leaves them as they are."""
+    """Running statistics, updated by the batch; None leaves them unchanged."""
     image: Any = None
     batch: Any = None
 
@@ -109,18 +109,18 @@ METHODS: dict[str, Method] = {
 }
 
 
-GONE = "trains"  # a field of earlier versions, which files of weights still hold
+GONE = "trains"  # a field of earlier versions that weights files still contain
 
 
 class UnknownMethod(UserError):
     """A file names a method that is not registered."""
 
 
-_included: dict[str, Path | str] = {}  # what `include` imported -> where that is
+_included: dict[str, Path | str] = {}  # module or file that `include` imported -> its location
 
 
 def register(method: Method) -> None:
-    """Adds a method and its presets; ValueError if another one has its name, or the name of a preset."""
+    """Adds a method and its presets; ValueError if another method or preset has the same name."""
     name = method.config.method
     if name in METHODS:
         require(METHODS[name].config is method.config, f"there is a method {name} already; choose another name")
@@ -132,7 +132,7 @@ def register(method: Method) -> None:
 
 
 def include(source: Path | str) -> None:
-    """Imports a module, or a .py file, that registers methods; ValueError, in one line, if that cannot be done."""
+    """Imports a module or a .py file that registers methods; a one-line ValueError if that fails."""
     name = str(source)
     place = Path(name).resolve() if name.endswith(".py") else name
     if place in _included.values():
@@ -152,7 +152,7 @@ def include(source: Path | str) -> None:
 
 @contextmanager
 def _working_folder():
-    """Modules of the working folder are found, as `python` finds them and an installed command does not."""
+    """Makes modules of the working folder importable, as `python` does and an installed command does not."""
     sys.path.insert(0, str(Path.cwd()))
     try:
         yield
@@ -169,7 +169,7 @@ def _import_file(path: Path) -> None:
 
 
 def network(config: NetworkConfig) -> Any:
-    """The Linen module that a network's config describes; it is imported when it is first asked for."""
+    """The Linen module for a network's config; its code is imported at the first call."""
     made = method_of(config).network
     assert made is not None, f"{config.method} is no Linen module"
     return (later(made) if isinstance(made, str) else made)(config)
@@ -184,19 +184,19 @@ def method_of(config: NetworkConfig) -> Method:
 
 
 def label_of(name: str) -> str:
-    """What tables and pictures call a method."""
+    """The name of a method in tables and pictures."""
     return METHODS[name].label if name in METHODS and METHODS[name].label else name
 
 
 def to_dict(config: TrainConfig) -> dict:
-    """Nested plain dict of a training, with the method of its network and the file that brought it."""
+    """A training config as a nested dict, with the method of its network and the file that registered it."""
     values, source = dataclasses.asdict(config), method_of(config.model).source
     named = {"method": config.model.method} | ({"source": source} if source else {})
     return values | {"model": named | values["model"]}
 
 
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
-    """Training from `to_dict`'s form; a field unknown, missing or of another type raises ValueError with its path."""
+    """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
     kinds = types_of(kind)
     values = {name: value for name, value in values.items() if f"{path}{name}" != GONE}
     for name in values:
@@ -219,7 +219,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
 
 
 def _sizes(name: Any, source: Any, path: str) -> type[NetworkConfig]:
-    """Class of the config of a network that a file names; nothing is imported for it."""
+    """The config class of the network that a file names; nothing is imported for it."""
     if isinstance(name, str) and name in METHODS:
         return METHODS[name].config
     named = f"--methods {source}, or load(..., methods={source!r})" if source else "--methods and its file"

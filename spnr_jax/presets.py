@@ -1,7 +1,7 @@
-"""The presets: functions that return a TrainConfig, named as `spnr train --preset` takes them.
+"""The presets: functions that return a TrainConfig; `spnr train --preset` takes their names.
 
-The paper's network in its sizes and in smaller ones, then ours over surfels.  The network of the package was trained
-with the preset `surfels` (docs/model_card.md).
+First the paper's network in its published sizes and in smaller ones, then our surfel network.  The package's network
+was trained with the preset `surfels` (docs/model_card.md).
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from spnr_jax.config import (
     TrainConfig,
 )
 
-PAPER = EncoderConfig(inputs="spread", num_groups=1)  # of the paper's network, with what lets it learn hues
+PAPER = EncoderConfig(inputs="spread", num_groups=1)  # paper's encoder, changed to learn hues
 SHADED = LossConfig(l1_weight=1.0, mse_weight=5.0, adversarial_weight=0.0, opacity_weight=1.0, opacity_l1_weight=0.3)
 QUICK = OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995)
 
@@ -80,10 +80,10 @@ def tiny() -> TrainConfig:
 
 
 def surfels() -> TrainConfig:
-    """Our network over G-buffers of surfels, pictures of any size.  `spnr train --preset surfels DATA RUN`.
+    """Our surfel network, for pictures of any size.  `spnr train --preset surfels DATA RUN`.
 
-    DATA of `spnr-data generate` with --resolution 512 --points 65536.  Some hours on two CPU cores, the first of them
-    for the G-buffers, which take some 10 MB of disk a cloud.  Expected figures: docs/lab/surfels.md.
+    DATA is from `spnr-data generate --resolution 512 --points 65536`.  Some hours on two CPU cores, of which the first
+    are for the G-buffers, which take some 10 MB of disk per cloud.  Expected figures: docs/lab/surfels.md.
     """
     return TrainConfig(
         preset="surfels",
@@ -103,9 +103,9 @@ def surfels() -> TrainConfig:
 
 
 def surfels_tiny() -> TrainConfig:
-    """Ours, narrower, minutes on two CPU cores.  `spnr train --preset surfels_tiny DATA RUN`.
+    """Our surfel network, narrower; minutes on two CPU cores.  `spnr train --preset surfels_tiny DATA RUN`.
 
-    For pictures of 64 px: at that size nothing is doubled, so larger pictures are not learnt.
+    For pictures of 64 px: it is not trained to double a resolution, which larger pictures need.
     """
     return TrainConfig(
         preset="surfels_tiny",
@@ -122,4 +122,4 @@ def surfels_tiny() -> TrainConfig:
 
 PAPERS = (abo, shapenet_car, shapenet_plane, shapenet_chair, small, tiny)
 PRESETS: dict[str, Callable[[], TrainConfig]] = {preset.__name__: preset for preset in (*PAPERS, surfels, surfels_tiny)}
-"""By name; `methods.register` adds those of a method of one's own."""
+"""By name; `methods.register` adds the presets of your own methods."""

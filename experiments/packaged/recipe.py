@@ -1,13 +1,13 @@
-"""The networks of the package from scratch: pictures of objects, the densifier, then the shader on what it densifies.
+"""Trains the package's networks from scratch: data, the densifier, then the shader on densified clouds.
 
     python -m experiments.packaged.recipe --meshes MESHES --test-list TEST --out runs/weights [--share 0.1]
 
-    OUT/data/         pictures of meshes, of stretched ones and of procedural objects (`spnr-data generate`)
+    OUT/data/         pictures of meshes, of their variants and of procedural objects (`spnr-data generate`)
     OUT/densifier/    records of points, checkpoint and weights of the densifier
-    OUT/run/          training of the shader: weights.npz, and the densifier.npz that it was trained with
-    OUT/scores.json   PSNR, inside and outlines of objects that neither network saw, without each of them and with both
+    OUT/run/          training run of the shader: weights.npz, and the densifier.npz that it was trained with
+    OUT/scores.json   PSNR, inside and outline of test objects: without networks, without learned points, with both
 
-Each part goes on where it was stopped.  `spnr render cloud.ply --run OUT/run` draws with the result.
+Each part continues where it stopped.  `spnr render cloud.ply --run OUT/run` uses the result.
 """
 
 import dataclasses
@@ -36,9 +36,9 @@ from spnr_jax.scoring.picture_scores import sharpness
 from spnr_jax.training import trainer
 from spnr_jax.training.weights import load
 
-PROCEDURAL, VARIANTS = 240, 2  # objects, and those of each mesh that are stretched and coloured anew
+PROCEDURAL, VARIANTS = 240, 2  # procedural objects; variants of each mesh (stretched, with new colours)
 DENSIFIER_STEPS, STEPS = 7_000, 10_000
-COUNTS = (256, 1024, 4096, 16_384)  # points with which both are scored
+COUNTS = (256, 1024, 4096, 16_384)  # numbers of points in the scores
 PARTS: tuple[tuple[str, bool, Quality], ...] = (
     ("discs and light alone", False, "draft"),
     ("no learned points", False, "best"),
@@ -52,23 +52,23 @@ class Recipe:
     """Train the networks of the package from meshes."""
 
     meshes: Path | None = None
-    """Folder of .glb, .gltf, .obj and .ply files that train beside the procedural objects (default: none)."""
+    """Folder of .glb, .gltf, .obj and .ply files that are trained on beside the procedural objects (default: none)."""
     test_list: Path | None = None
-    """Text file with the ids of meshes that neither network sees: the last part scores them."""
+    """Text file with the ids of the test meshes: neither network is trained on them, the last part scores them."""
     maps: Path | None = None
-    """Folder of environment maps that light a fifth of the views (default: the room, skies and lamps alone)."""
+    """Folder of environment maps that light a fifth of the views (default: only the room, skies and lamps)."""
     out: Path = Path("runs/weights")
-    """Folder of all that is made."""
+    """Output folder."""
     share: float = 1.0
     """Share of the objects and of the steps: 0.1 for a trial."""
     workers: int | None = None
-    """Processes that render (default: one per CPU core)."""
+    """Rendering processes (default: one per CPU core)."""
     seed: int = 0
     """Seed of data and training."""
 
 
 def main(recipe: Recipe) -> None:
-    """Each part in turn, with its seconds."""
+    """Runs each part in turn and prints its time."""
     cli.set_up_jax()
     seconds = Seconds(recipe.out / "seconds.json")
     seconds.measure("data", lambda: generate(generation_of(recipe)))
@@ -85,12 +85,12 @@ def main(recipe: Recipe) -> None:
 
 
 def scale(recipe: Recipe, count: int) -> int:
-    """This share of a number, one at least."""
+    """This share of a number, at least one."""
     return max(round(recipe.share * count), 1)
 
 
 def generation_of(recipe: Recipe) -> GenerateConfig:
-    """What the generator is asked for: views of 512 px under lights of their own."""
+    """The configuration of the data generator: views of 512 px, each in its own light."""
     lights = ("room", "room", "room", "random") + ((str(recipe.maps),) if recipe.maps else ())
     return GenerateConfig(
         out=recipe.out / "data",
@@ -113,7 +113,7 @@ def generation_of(recipe: Recipe) -> GenerateConfig:
 
 
 def train_densifier(recipe: Recipe, dataset: data_sets.Dataset) -> None:
-    """The densifier, on meshes and procedural objects of its own, without those of the test split."""
+    """Trains the densifier on meshes and its own procedural objects, without those of the test split."""
     options = densifier_training.Options(
         meshes=recipe.meshes,
         left_out=frozenset(dataset.splits["test"]),
@@ -126,7 +126,7 @@ def train_densifier(recipe: Recipe, dataset: data_sets.Dataset) -> None:
 
 
 def score(run: Path, dataset: data_sets.Dataset) -> dict[str, dict[str, float]]:
-    """Mean scores of the test objects, a row for each number of points and each part that is left out, and a line."""
+    """Mean scores of the test objects, a row for each number of points and each of PARTS; prints each row."""
     model, rows = load(run), {}
     for count in COUNTS:
         found: dict[str, list[list[float]]] = {}
@@ -148,7 +148,7 @@ def score(run: Path, dataset: data_sets.Dataset) -> dict[str, dict[str, float]]:
 def score_object(
     model: Model, item: data_sets.ObjectData, cloud: PointCloud, densify: bool, quality: Quality
 ) -> list[float]:
-    """COLUMNS of an object, means over its views, each in its own light."""
+    """The scores COLUMNS of an object, means over its views, each in its own light."""
     pictures = draw_volume(model, model.encode(cloud, densify=densify), item, quality)
     drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images.astype(np.float32) / 255, strict=True)
     found = [[getattr(one, name) for name in COLUMNS] for one in (sharpness(*view) for view in drawn)]

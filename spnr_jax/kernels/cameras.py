@@ -92,7 +92,7 @@ def project(
 def intersect_box(
     origins: Float[Array, "*batch 3"], directions: Float[Array, "*batch 3"], lo: float = -1.0, hi: float = 1.0
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Bool[Array, "*batch"]]:
-    """Distances of entry (0 from inside) and exit of the cube [lo, hi]^3, and whether it is hit; a miss has 0, 0."""
+    """Distances to entry (0 from inside) and exit of the cube [lo, hi]^3, and whether it is hit; a miss has 0, 0."""
     parallel = jnp.abs(directions) < PARALLEL
     inverse = 1 / jnp.where(parallel, 1.0, directions)
     a, b = (lo - origins) * inverse, (hi - origins) * inverse
@@ -110,16 +110,16 @@ def orbit(
     distance: float | Float[Array, ""],
     centre: Float[Array, "3"],
 ) -> Float[Array, "3 4"]:
-    """Pose that looks at `centre` from a distance; angles in radians, azimuth around y from +z, elevation above xz."""
+    """Pose that looks at `centre` from a distance; radians: azimuth around y from +z, elevation above the xz plane."""
     horizontal = jnp.cos(elevation)
     direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
-    # seen from straight above or below, the picture's up is where the back of the object is
+    # from straight above or below, up in the picture is towards the back of the object
     up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
     return look_at(centre + distance * direction, centre, up)
 
 
 def in_box(camera: Camera, centre: Float[AnyArray, "3"], scale: Float[AnyArray, ""]) -> Camera:
-    """The camera (any axes of views) in the coordinates of the box."""
+    """The camera (any axes of views) in the coordinates of the normalised box."""
     rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
     eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale
     return dataclasses.replace(camera, cam_to_world=jnp.concatenate([rotation, eye[..., None]], axis=-1))

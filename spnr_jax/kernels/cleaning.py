@@ -1,21 +1,19 @@
 """Cleaning of scans: outliers are removed, noisy points are averaged; clean clouds are unchanged.
 
-    outliers    the mean distance of a point to its neighbours over the median of its neighbours' mean distances: the
-                idea of the local outlier factor (Breunig et al. 2000), so that smoothly varying density removes
-                nothing.  The limit is robust: a multiple of the median absolute deviation (MAD), and never below a
-                fixed ratio
-    noise       distance of the neighbours from the plane that most of them lie close to (least quantile of squares,
-                Rousseeuw 1984): at an edge or a thin wall, that is one of the faces, so that neither counts as noise.
-                The noise is that of a plane whose points would have these distances; in thick noise the neighbourhood
-                grows
-    averaging   each point is moved to its most likely true position, and then along the normal onto the plane of the
+    outliers    score: the mean distance of a point to its neighbours over the median of its neighbours' mean distances,
+                as in the local outlier factor (Breunig et al. 2000), so that smoothly varying density removes nothing.
+                The limit is robust: a multiple of the median absolute deviation (MAD), and never below a fixed ratio
+    noise       distance of the neighbours from the plane that most of them are close to (least quantile of squares,
+                Rousseeuw 1984).  At an edge or a thin wall, that plane is one of the faces, so neither counts as noise.
+                The noise is that of a noisy plane with the same distances.  In thick noise the neighbourhood grows
+    averaging   each point moves to its most likely true position, and then along the normal onto the plane of the
                 points around it (moving least squares, Alexa et al. 2001), within a radius that depends on the noise.
-                Points of similar colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not
-                merge.  Materials become the mean of those that then lie close.  The true position is given by Tweedie's
-                formula (Efron 2011), x + sigma^2 times the gradient of the logarithm of the density.  That gradient is
+                Only points of similar colour count (Tomasi & Manduchi 1998), so that letters stay and two layers do not
+                merge.  Materials become the mean over the points that are then close.  The true position is given by
+                Tweedie's formula (Efron 2011): x + sigma^2 times the gradient of the log density.  That gradient is
                 C^-1 (m - x), with mean m and covariance C of the points in a window around x (Hjort & Jones 1996).  A
-                plane becomes flat, a thin bar keeps its thickness
-    fringe      noise that remains in places with few points, beside places with many, is removed
+                plane becomes flat, and a thin bar keeps its thickness
+    fringe      remaining noise is removed where sparse points lie beside dense ones
 
 NumPy in, NumPy out, nearly linear in the number of points; the order of the points does not matter.
 """
@@ -35,46 +33,46 @@ Strength = Literal["auto", "strong"]
 Clean = Literal["auto", "off", "strong"]
 Values = dict[str, np.ndarray]
 
-LEAST_POINTS = 100  # fewer say nothing of what lies apart
-NEIGHBOURS = 8  # of a point whose mean distance counts
-SPARSE = 3.0  # times the median distance, from which on the neighbours may be outliers themselves
-WIDE = 64  # neighbours that are asked then
-ROUND = 16, 0.05  # neighbours of a sparse point, and the share of their variance that the plane has across, on which
-MOST_ROUND = 0.1  # they lie in space and not on a surface: an outlier unless so large a share of all points does
-UNLISTED = 0.6  # of what else is borne, for a point that is among the neighbours of none
-FEW, CHANCE = 4, 3e-4  # points, and share of all, that chance sets apart in a cloud sampled at random
-SURE = 2.0  # of what is borne, from which on even these are outliers
-ROUNDS = 3  # outliers hide others behind them
-DEVIATIONS = {"auto": 7.0, "strong": 5.0}  # standard deviations of the logarithm, from the MAD, that are borne
-LEAST_RATIO = {"auto": 2.0, "strong": 1.6}  # to the neighbours' distance that is always borne: corners have it
-LEAST_DENSE = 1500  # points; of fewer, curvature would count as noise, and a bar as points in space
-NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise from which on points are averaged
+LEAST_POINTS = 100  # with fewer points, outliers cannot be told from the surface
+NEIGHBOURS = 8  # whose mean distance is a point's score
+SPARSE = 3.0  # times the median distance, above which the neighbours may be outliers themselves
+WIDE = 64  # neighbours that are considered in that case
+ROUND = 16, 0.05  # neighbours of a sparse point; share of their variance across the plane, above which
+MOST_ROUND = 0.1  # they fill a volume: the point is an outlier, unless so large a share of all points does so
+UNLISTED = 0.6  # factor on the limit for a point that is no other point's neighbour
+FEW, CHANCE = 4, 3e-4  # number and share of points that random sampling may isolate
+SURE = 2.0  # factor on the limit above which even these are outliers
+ROUNDS = 3  # repeated, because outliers hide others behind them
+DEVIATIONS = {"auto": 7.0, "strong": 5.0}  # limit in standard deviations (from the MAD) of the logarithm of the score
+LEAST_RATIO = {"auto": 2.0, "strong": 1.6}  # the limit on the score is never below this: corners reach it
+LEAST_DENSE = 1500  # points; with fewer, curvature would count as noise, and a bar as points in space
+NOISY = {"auto": 0.45, "strong": 0.25}  # spacings of noise above which points are averaged
 SAMPLE = 2048  # points at which the noise is measured
-PLANES = 48  # through three neighbours each, of which the best is taken
-HEIGHTS = 32  # neighbours whose distances from a plane are measured
-SHARE = 0.35  # of them that have to lie close to it
-FLATTEST = 0.25  # share of the places that the noise is told by: elsewhere edges and thin walls add to it
+PLANES = 48  # candidate planes, each through three neighbours
+HEIGHTS = 32  # neighbours whose heights above a plane are measured
+SHARE = 0.35  # quantile of the heights that the best plane minimises
+FLATTEST = 0.25  # share of the places from which the noise is estimated: elsewhere edges and thin walls add to it
 NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)  # over the neighbourhood's radius
 THICKNESS = (0.0, 0.012, 0.024, 0.0355, 0.047, 0.0556, 0.0624, 0.0681, 0.0726, 0.0766, 0.0798, 0.0822, 0.0836)
-# largest distance from the best plane, over the radius, in a plane with these noises: what is thick looks like any ball
-THICKEST = 0.08  # that tells the noise; of thicker neighbourhoods wider ones are asked
-WIDER, MOST_WIDE = 2, 16  # times as many neighbours, and share of all points that they stay below
-RADIUS = 1.0  # standard deviations of the noise in that of a neighbour's weight; wider ones eat thin parts
-LEAST_RADIUS = 1.0  # spacings: the same at least
-AROUND = 64  # points that give a plane
-ALIKE, COLOUR_NOISE = 0.1, 2.0  # deviation of the weight of a colour (square roots), at least; times their own noise
-MEAN, MEANT = 0.7, 32  # radius of the mean of the values over the noise, or the spacing; points that it takes
+# largest height above the best plane, over the radius, for planes with these noises: a thick layer looks like a ball
+THICKEST = 0.08  # of a neighbourhood that determines the noise; thicker ones are enlarged
+WIDER, MOST_WIDE = 2, 16  # factor on the number of neighbours; upper bound as a share of all points
+RADIUS = 1.0  # standard deviation of a neighbour's weight over that of the noise; wider ones erode thin parts
+LEAST_RADIUS = 1.0  # the same in spacings, at least
+AROUND = 64  # points in a local fit
+ALIKE, COLOUR_NOISE = 0.1, 2.0  # standard deviation of the weight by colour (square roots): least, over the noise
+MEAN, MEANT = 0.7, 32  # radius of the mean of the materials, over the noise or the spacing; points in it
 ROWS = 2**13  # points that are moved at a time: their neighbours fit into the cache
-CELL = 1.0, 3.0  # standard deviations of the noise, spacings: side of a voxel that shows the fringe, the larger of both
-CELLS = 27  # voxels that are compared
-THIN = 0.3  # of the points that those hold, for a point of theirs, below which a voxel is fringe
-MOST_MOVED = 2**17  # points that are moved; of more, a part
+CELL = 1.0, 3.0  # side of a voxel for the fringe: the larger of these standard deviations of the noise and spacings
+CELLS = 27  # neighbouring voxels that are compared
+THIN = 0.3  # a voxel is fringe with fewer points than this share of the mean in the voxels of its neighbours
+MOST_MOVED = 2**17  # points that are moved; of more points, a part
 
 
 class Cleaned(NamedTuple):
-    """Points that are left and their other columns; a line about each thing that was done; the noise averaged.
+    """The remaining points and their other columns; one line per change; the standard deviation of the removed noise.
 
-    `noise` is its standard deviation in the units of the positions, 0 where none was averaged.
+    `noise` is in the units of the positions, 0 where no points were averaged.
     """
 
     positions: Float[np.ndarray, "left 3"]
@@ -84,10 +82,10 @@ class Cleaned(NamedTuple):
 
 
 def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, list[str]]:
-    """The cloud without outliers and, where it is noisy, averaged; and a line about each thing that was done.
+    """The cloud without outliers and, where it is noisy, averaged; and one line per change.
 
-    A cloud in which nothing is found comes back itself.  Else masked points are gone, too.  "strong" removes and
-    averages at smaller deviations.  ValueError for a batch of clouds or an unknown strength.
+    A clean cloud is returned unchanged; otherwise masked points are dropped, too.  "strong" removes and averages at
+    smaller deviations.  ValueError for a batch of clouds or an unknown strength.
     """
     if strength not in NOISY:
         raise UserError(f"strength must be one of {', '.join(NOISY)}, got {strength!r}")
@@ -103,7 +101,7 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
 
 
 def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
-    """The points and other columns (points, ...) without outliers, and averaged; what is sound is not copied."""
+    """Points and other columns (points, ...) without outliers, and averaged; clean columns are not copied."""
     lines = []
     apart = outliers(positions, strength)
     if apart.any():
@@ -121,7 +119,7 @@ def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, stre
 
 
 def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
-    """True for points that are much farther from their neighbours than these from theirs."""
+    """True for points that are much farther from their neighbours than their neighbours are from theirs."""
     distinct, copies = find_distinct(positions)
     left = np.arange(len(distinct))
     if len(left) >= LEAST_POINTS:
@@ -143,7 +141,7 @@ def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "aut
 def _without(
     apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and rows of the neighbours, itself first, of every point that is left; the tree holds these."""
+    """Distances and rows of the neighbours of all remaining points, themselves first; the tree holds these points."""
     distances, near = distances[~apart], near[~apart]
     lost = apart[near].any(axis=1)
     near = (np.cumsum(~apart) - 1)[near]
@@ -175,16 +173,16 @@ def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Str
 
 
 def _across(near: np.ndarray) -> np.ndarray:
-    """Share (n,) of the variance of points (n, k, 3) along its least axis: 0 of a plane, a third of a ball."""
+    """Share (n,) of the variance of points (n, k, 3) along their narrowest axis: 0 for a plane, 1/3 for a ball."""
     offset = near - near.mean(axis=1, keepdims=True)
     squared = np.linalg.eigvalsh(np.swapaxes(offset, 1, 2) @ offset)
     return squared[:, 0] / np.maximum(squared.sum(axis=1), np.finfo(np.float64).tiny)
 
 
 def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
-    """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) of too few points.
+    """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) for too few points.
 
-    From LEAST_DENSE points on they can be told from curvature.  In the units of the positions.
+    Below LEAST_DENSE points, noise cannot be told from curvature.  In the units of the positions.
     """
     distinct, _ = find_distinct(positions)
     if len(distinct) < LEAST_DENSE:
@@ -202,7 +200,7 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
 
 
 def _heights(near: np.ndarray) -> np.ndarray:
-    """Distance (n,) within which SHARE of the neighbours (n, HEIGHTS, 3) lie of the best plane through three."""
+    """Height (n,) within which SHARE of the neighbours (n, HEIGHTS, 3) lie of the best plane through three."""
     rng = np.random.default_rng(0)
     best = np.full(len(near), np.inf)
     for a, b, c in (rng.choice(HEIGHTS, 3, replace=False) for _ in range(PLANES)):
@@ -212,19 +210,19 @@ def _heights(near: np.ndarray) -> np.ndarray:
         offset = np.abs(np.einsum("nkc,nc->nk", near - near[:, a, None], normal))
         reach = np.partition(offset, int(SHARE * HEIGHTS), axis=1)[:, int(SHARE * HEIGHTS)]
         best = np.where(length[:, 0] > 0, np.minimum(best, reach), best)
-    return np.where(np.isfinite(best), best, 0)  # three neighbours in a line span no plane: nothing is known
+    return np.where(np.isfinite(best), best, 0)  # three collinear neighbours span no plane
 
 
 def denoise(
     positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float, deviations: float = RADIUS
 ) -> tuple[Float[np.ndarray, "moved 3"], Values]:
-    """Points moved against noise of this standard deviation, at most MOST_MOVED, and the means of their values.
+    """Points moved to remove noise of this standard deviation, at most MOST_MOVED, and the local means of their values.
 
-    `deviations` of the noise are the radius of a neighbour's weight; the same rows come back for each.  Normals stay of
-    unit length, 0 where they contradict each other.
+    The radius of a neighbour's weight is `deviations` times the noise; the same rows come back for each
+    radius.  Normals keep unit length, or are 0 where they contradict each other.
     """
     radius = max(deviations * sigma, LEAST_RADIUS * spacing)
-    order = np.lexsort(positions.T)  # so that a part is spread over the cloud, and the same whatever the points' order
+    order = np.lexsort(positions.T)  # a part is then spread over the cloud, and independent of the order of the points
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
     basis, rows = order[:: max(1, int(within / AROUND))], order[:: -(-len(order) // MOST_MOVED)]
     start, known = positions[rows].astype(np.float64), positions[basis].astype(np.float64)
@@ -243,7 +241,7 @@ def denoise(
 
 
 def _alike(tree: cKDTree, color: np.ndarray) -> float:
-    """Standard deviation of the weight of a neighbour's colour: wider than the noise of the colours (n, channels)."""
+    """Standard deviation of a neighbour's weight by colour: wider than the noise of the colours (n, channels)."""
     sample = slice(None, None, -(-tree.n // SAMPLE))
     near = tree.query(tree.data[sample], list(range(1, min(AROUND, tree.n) + 1)), workers=-1)[1]
     apart = np.linalg.norm(color[near] - color[sample, None], axis=-1)
@@ -259,7 +257,7 @@ def _denoise_step(
     radius: float,
     alike: float,
 ) -> np.ndarray:
-    """Points (n, 3) with colours moved by what the tree's points of like colour around them tell."""
+    """Points (n, 3) after one step, from the points of similar colour around them."""
 
     def spread(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         near, weights = _around(points, tree, radius, AROUND)
@@ -268,14 +266,14 @@ def _denoise_step(
         return _spread(points, tree.data[near], weights)
 
     towards, squared, axes = spread(start)
-    squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # the least that a window of noise leaves
+    squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # least variance of a window of pure noise
     moved = start + np.einsum("nij,nj->ni", axes, sigma**2 / squared * towards)
     towards, _, axes = spread(moved)
     return moved + towards[:, :1] * axes[..., 0]
 
 
 def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
-    """Means of the columns of the points around each."""
+    """Local means of the columns, over the points around each position."""
     tree = cKDTree(positions)
     pieces = [_around(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
     return {
@@ -285,14 +283,14 @@ def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
 
 
 def _around(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n, k) of at most so many neighbours of points (n, 3), and their weights, of sum 1."""
+    """Rows (n, k) of at most `most` neighbours of points (n, 3), and their weights, which sum to 1."""
     distances, near = tree.query(points, list(range(1, min(most, tree.n) + 1)), workers=-1)
     weights = np.exp(-0.5 * (distances / radius) ** 2)
     return near, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
 
 
 def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Way to the mean of the neighbours (n, k, 3) along the axes of their covariance, its eigenvalues, and the axes."""
+    """Offset to the mean of the neighbours (n, k, 3) along the axes of their covariance, the eigenvalues, the axes."""
     offset = near - points[:, None]
     mean = (weights[:, None] @ offset)[:, 0]
     offset = (offset - mean[:, None]) * np.sqrt(weights)[..., None]
@@ -301,12 +299,12 @@ def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[
 
 
 def fringe_cell(sigma: float, spacing: float) -> float:
-    """Side of the voxels that show the fringe of points with this noise and spacing."""
+    """Side of the voxels for `fringe`, from the noise and the spacing."""
     return max(CELL[0] * sigma, CELL[1] * spacing)
 
 
 def fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:
-    """True for points in voxels of this side that hold far fewer than the voxels of the points around them."""
+    """True for points in voxels of this side that hold far fewer points than the voxels around them."""
     _, first, rows, count = np.unique(
         voxel_keys(positions - positions.min(axis=0), side), return_index=True, return_inverse=True, return_counts=True
     )

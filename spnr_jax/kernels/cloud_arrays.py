@@ -1,10 +1,10 @@
-"""Arrays of a cloud before a network sees it: padding, repeated points, thinning.  NumPy in, NumPy out.
+"""A cloud's arrays before a network sees them: padding, repeated points, thinning.  NumPy in, NumPy out.
 
-repeats     points within NEAR of the median spacing are merged; a cloud that then is no surface is refused.  The
-            spacing is estimated from many neighbours, so that a scan that was written several times does not hide it
-thinning    a random sample while reading, voxels, then farthest points.  A voxel keeps the first of its points in the
-            order of the file; voxels are halved around a fixed corner, so that the result depends on the points and
-            their order alone.  Thinning with voxels first bounds the memory and time of farthest-point sampling.
+repeats     points closer than NEAR times the median spacing are merged; a cloud that then has no surface is refused.
+            The spacing is estimated from many neighbours, so that repeated copies of a scan do not bias it
+thinning    a random sample while reading, then voxels, then farthest-point sampling.  A voxel keeps its first point in
+            file order; voxels are halved around a fixed corner, so that the result depends only on the points and
+            their order.  Voxels bound the memory and time of the farthest-point sampling
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ SMALLEST_BUCKET = 512
 
 
 def pad(cloud: PointCloud, size: int) -> PointCloud:
-    """The cloud (points, ...) with zeros behind it up to `size` points, for which `mask` is False."""
+    """The cloud (points, ...), padded with zeros to `size` points; `mask` is False for padding."""
     missing = size - len(cloud.mask)
     if missing < 0:
         raise UserError(f"a cloud of {len(cloud.mask)} points does not fit into {size}; thin it out first")
@@ -41,7 +41,7 @@ def strip(cloud: PointCloud) -> PointCloud:
 
 
 def bucket(count: int) -> int:
-    """The smallest of 512, 1024, 2048, ... that holds `count` points: few sizes, so few compilations."""
+    """The smallest of 512, 1024, 2048, ... that is not below `count`: few sizes, so few compilations."""
     if count < 1:
         raise UserError(f"a cloud needs at least 1 point, got {count}")
     return max(SMALLEST_BUCKET, 1 << (count - 1).bit_length())
@@ -50,7 +50,7 @@ def bucket(count: int) -> int:
 def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
     """(centre (3,), scale ()): (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
 
-    The scale of points without extent is 1.
+    The scale is 1 if all points coincide.
     """
     low, high = (np.asarray(bound, np.float64) for bound in (positions.min(axis=0), positions.max(axis=0)))
     diagonal = np.linalg.norm(high - low)
@@ -62,7 +62,7 @@ def plain_cloud(
     base_color: Float[np.ndarray, "points 3"] | float = 0.5,
     normals: Float[np.ndarray, "points 3"] | None = None,
 ) -> PointCloud:
-    """Points of one material, grey unless said otherwise: roughness 0.5, metallic 0; all are real."""
+    """Points of one material, grey by default, with roughness 0.5 and metallic 0; none is padding."""
     count = len(positions)
     return PointCloud(
         positions=positions,
@@ -78,18 +78,18 @@ def plain_cloud(
 
 
 Values = dict[str, np.ndarray]
-NEAR = 1e-3  # of the median spacing
-AROUND, SAMPLE = 128, 1024  # neighbours that tell the spacing, at so many points
-FEW = 8  # distinct points, of which a spacing says nothing
-PLACE = 1e-6  # of the extent: what lies closer is one place
-LINE = 1e-13  # of the variance along a line, that there may be across it
+NEAR = 1e-3  # times the median spacing
+AROUND, SAMPLE = 128, 1024  # neighbours that determine the spacing; points at which it is estimated
+FEW = 8  # distinct points: with fewer, the spacing is meaningless
+PLACE = 1e-6  # of the extent: closer points share one place
+LINE = 1e-13  # largest variance of a line across it, as a share of that along it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
 def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> tuple[np.ndarray, Values, int]:
-    """The points without repeats, the means of their other columns (points, ...), and how many were merged.
+    """The points without repeats, the means of their other columns (points, ...), and the number of merged points.
 
-    Of points that are merged the first stays where it is; a cloud without repeats comes back itself.
+    Of merged points, the first keeps its position.  A cloud without repeats is returned unchanged.
     """
     labels = _labels(positions)
     _, first, group = np.unique(labels, return_index=True, return_inverse=True)
@@ -104,13 +104,13 @@ def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> t
 
 
 def unit_means(normals: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-    """Means of unit normals at length 1, 0 where these contradict each other."""
+    """Means of unit normals, rescaled to length 1; 0 where they cancel."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > CANCELLED, normals / np.maximum(length, CANCELLED), 0)
 
 
 def _labels(positions: np.ndarray) -> np.ndarray:
-    """A number (points,) for each place; the same for points that are equal or nearly so."""
+    """A label (points,) for each position; equal and nearly equal points share one."""
     distinct, rows = find_distinct(positions)
     if len(distinct) < FEW:
         return rows
@@ -125,7 +125,7 @@ def _labels(positions: np.ndarray) -> np.ndarray:
 def find_distinct(
     positions: Float[np.ndarray, "points 3"],
 ) -> tuple[Float[np.ndarray, "places 3"], Int[np.ndarray, " points"]]:
-    """Positions without repetitions, sorted, which also keeps neighbours close in memory; the row of each."""
+    """Distinct positions, sorted (which keeps neighbours close in memory), and the row of each point among them."""
     order = np.lexsort(positions.T)
     ranked = positions[order]
     new = np.ones(len(ranked), bool)
@@ -136,7 +136,7 @@ def find_distinct(
 
 
 def spacing(tree: cKDTree) -> float:
-    """Median side of the square that a point stands for, from the distance of many neighbours."""
+    """Median side of the square that a point represents, from the distances of many neighbours."""
     count = max(2, min(AROUND, tree.n // 4))
     radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count])[0]
     return float(np.median(radius)) * float(np.sqrt(np.pi / count))
@@ -152,7 +152,7 @@ def _means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def require_surface(positions: Float[np.ndarray, "points 3"], before: int) -> None:
-    """ValueError where points (n, 3), of which there were `before`, are no surface: one place, two, or a line."""
+    """ValueError if points (n, 3), originally `before`, span no surface: one place, two places, or a line."""
     extent = float(np.ptp(positions, axis=0).max())
     steps = np.round((positions - positions.min(axis=0)) / max(PLACE * extent, np.finfo(np.float64).tiny))
     places = 1 if extent == 0 else len(np.unique(steps, axis=0)) if len(positions) < FEW**4 else FEW
@@ -169,23 +169,23 @@ def require_surface(positions: Float[np.ndarray, "points 3"], before: int) -> No
 
 Columns = dict[str, np.ndarray]
 
-THINNING = 16  # farthest-point sampling starts from at most this many times the points that it keeps
-INNER = (0.05, 0.95)  # quantiles along each axis between which the extent of a cloud is measured: outliers do not count
+THINNING = 16  # farthest-point sampling starts from at most this many times the number of points to keep
+INNER = (0.05, 0.95)  # quantiles along each axis that define the extent of a cloud: outliers do not count
 HALVINGS = 20  # of the extent, to the smallest voxel that is tried
 SMALLEST_EXTENT = 1e-30  # where all points coincide
-FARTHEST = 1e18  # from the middle, in the file's units, up to which distances are squared as they are
-FIRST = 256  # farthest points that are found among all; after them a new one is the nearest of few
-FAR = 0.95  # of the largest squared distance, from which on points are looked at for the farthest
-BEYOND = 1 + 1e-5  # times the distance within which points are asked for, whatever single precision makes of it
+FARTHEST = 1e18  # distance from the middle, in the file's units, up to which squared distances fit float32
+FIRST = 256  # farthest points that are searched among all points; later ones among few candidates
+FAR = 0.95  # of the largest squared distance: points above it are candidates for the farthest
+BEYOND = 1 + 1e-5  # factor on query radii that covers rounding in single precision
 KEY_BITS = 21  # of a voxel's index along an axis
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: multiples of it are spread over 0..2^64 - 1
 
 
 def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
-    """Columns of at most `most` rows of all pieces, each with the same chance, and how many rows there are.
+    """Columns of at most `most` rows of all pieces, each with the same chance, and the total number of rows.
 
-    All where there are no more, else at least half as many.  Whether a row is kept depends on its number alone, and no
-    more than the kept rows and one piece are in memory.
+    All rows if there are no more than that, otherwise at least half of `most`.  Whether a row is kept depends only on
+    its number.  At any time, only the kept rows and one piece are in memory.
     """
     kept: Columns = {}
     keys, seen, halvings = np.zeros(0, np.uint64), 0, 0
@@ -203,13 +203,13 @@ def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
 
 
 def _rows_below(columns: Columns, keys: np.ndarray, halvings: int) -> tuple[Columns, np.ndarray]:
-    """Columns and keys of the rows whose key is in the lowest 1 / 2^halvings of all numbers."""
+    """Columns and keys of the rows with a key in the lowest 1 / 2^halvings of the range."""
     taken = keys >> np.uint64(64 - halvings) == 0
     return {name: values[taken] for name, values in columns.items()}, keys[taken]
 
 
 def stack_columns(columns: Columns, names: Iterable[str] = "xyz") -> np.ndarray:
-    """Columns (points, names) float64 side by side; those of positions unless others are named."""
+    """Columns (points, names) as one float64 array; the positions by default."""
     return np.stack([np.asarray(columns[name], np.float64) for name in names], axis=-1)
 
 
@@ -219,9 +219,9 @@ def first_in_voxels(positions: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def voxel_keys(positions: np.ndarray, voxel: float) -> np.ndarray:
-    """A number for each of positions (n, 3), the same for those in one cube of side `voxel`.
+    """A key for each of positions (n, 3), the same for all in one cube of side `voxel`.
 
-    What lies more than 2^20 voxels from 0 falls into the outermost ones.
+    Positions more than 2^20 voxels from 0 are clipped to the outermost voxels.
     """
     half = 2.0 ** (KEY_BITS - 1)
     x, y, z = (np.clip(np.floor(positions.T / voxel), -half, half - 1) + half).astype(np.int64)
@@ -235,9 +235,9 @@ def frame(positions: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def candidates(positions: np.ndarray, count: int) -> np.ndarray:
-    """Sorted indices of at most THINNING * count points, at least `count`: those of the finest voxels that fit.
+    """Sorted indices of count to THINNING * count points: the first points of the finest voxels that fit.
 
-    Points that coincide share every voxel; where voxels leave too few, the first others are added.
+    Points that coincide share every voxel; if voxels leave too few points, the first of the others are added.
     """
     if len(positions) <= THINNING * count:
         return np.arange(len(positions))
@@ -256,8 +256,8 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
 def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Indices (count,) of points (n, 3), each the farthest from those before it; n >= count.
 
-    So any first ones of them are evenly spread.  The seed chooses the very first; of points equally far the first in
-    the file comes first.  Beyond THINNING * count points voxels thin them before: the time is near count log count.
+    So any prefix is evenly spread.  The seed chooses the first point; ties go to the first in the file.  Beyond
+    THINNING * count points, voxels thin them first: the time is close to count log count.
     """
     among = candidates(positions, count)
     centred = positions[among] - positions.mean(axis=0)
@@ -279,16 +279,15 @@ def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 
 def _squares(columns: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Squared distances (n,) of points, as columns (3, n), from a place (3,)."""
+    """Squared distances (n,) of points, as columns (3, n), to a place (3,)."""
     (x, y, z), (a, b, c) = columns, place
     return (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
 
 
 def _go_on(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
-    """Chooses points from FIRST on: a new point changes the distances of those alone that are nearer to it than it was
-    to the ones before.
+    """Chooses points from FIRST on: a new point changes only the distances of points that it is nearest to.
 
-    Distances only shrink, so while one of the far points is still far, the farthest of all is among them.
+    Distances only shrink, so as long as one of the candidates is still far, the farthest point is among them.
     """
     rows = np.ascontiguousarray(columns.T)
     tree = cKDTree(rows)
@@ -298,11 +297,11 @@ def _go_on(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None
         reach = max(float(squared[last]), 0.0) ** 0.5
         near = np.array(tree.query_ball_point(rows[last], BEYOND * reach), np.int64)
         squared[near] = np.minimum(squared[near], _squares(columns[:, near], rows[last]))
-        squared[last] = -1  # never again, not even where points coincide
+        squared[last] = -1  # never again, even where points coincide
         among = squared[far]
         if not (among >= least).any():
             least = FAR * squared.max()
-            if least == 0:  # what is left coincides with what is chosen
+            if least == 0:  # the remaining points coincide with chosen ones
                 chosen[step:] = np.flatnonzero(squared == 0)[: len(chosen) - step]
                 return
             far = np.flatnonzero(squared >= least)

@@ -1,9 +1,9 @@
 """Emission-absorption along a ray: from densities at samples to a pixel.
 
-Vocabulary (NeRF, eq. 3): `density` >= 0 per unit length, `delta` the length of a sample's interval, optical depth
-`tau = density * delta`, `transmittance` the share of light that reaches a point, `weights` the share that stops in each
-interval, `acc` their sum (opacity), residual transmittance 1 - acc.  Intervals are finite: light that passes the last
-one meets the background.  All of it is float32.
+Vocabulary (NeRF, eq. 3): `density` >= 0 per unit length; `delta`, the length of a sample's interval; optical depth
+`tau = density * delta`; `transmittance`, the share of light that reaches a point; `weights`, the share that stops in
+each interval; `acc`, their sum (opacity); residual transmittance 1 - acc.  Intervals are finite: light that passes the
+last one meets the background.  Everything is float32.
 """
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from spnr_jax.kernels.numerics import one_minus_exp
 def interval_lengths(
     distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]
 ) -> Float[Array, "*batch samples"]:
-    """Length that each sorted sample owns: up to the next one, the last up to `far`."""
+    """Length of each sorted sample's interval: up to the next sample, the last one up to `far`."""
     return jnp.diff(distances, axis=-1, append=far[..., None])
 
 
@@ -24,8 +24,8 @@ def volume_weights(
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch"]]:
     """Weights exp(-sum of tau before) * (1 - exp(-tau)), and the residual transmittance exp(-sum of all tau).
 
-    1 - exp is `one_minus_exp` (a thin interval would be lost, and an opaque one's gradient), and optical depths are
-    summed before one exp, not transmittances multiplied.  An infinite optical depth is opaque, with zero gradient.
+    `one_minus_exp` keeps thin intervals, and the gradient of opaque ones.  Optical depths are summed before one exp,
+    instead of multiplying transmittances.  An infinite optical depth is opaque, with zero gradient.
     """
     tau = density * delta
     through = jnp.cumsum(tau, axis=-1)
@@ -38,7 +38,7 @@ def composite(
     values: Float[Array, "*batch samples features"],
     background: Float[Array, "*#batch features"] | float = 0.0,
 ) -> Float[Array, "*batch features"]:
-    """Sum of weights * values, plus the background for the light that nothing stops."""
+    """Sum of weights * values, plus the background times the residual transmittance."""
     acc = jnp.sum(weights, axis=-1, keepdims=True)
     return jnp.einsum("...s,...sf->...f", weights, values, precision="highest") + (1 - acc) * background
 
@@ -46,5 +46,5 @@ def composite(
 def expected_distance(
     weights: Float[Array, "*batch samples"], distances: Float[Array, "*batch samples"], far: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Weighted sum of the sample distances [paper]; the light that nothing stops counts as `far`."""
+    """Weighted sum of the sample distances [paper]; the residual transmittance counts at `far`."""
     return jnp.sum(weights * distances, axis=-1) + (1 - jnp.sum(weights, axis=-1)) * far

@@ -1,8 +1,8 @@
-"""Pictures as arrays: the sRGB curve (IEC 61966-2-1), and resizing, bilinear or by means over squares of pixels.
+"""Images as arrays: the sRGB curve (IEC 61966-2-1), and resizing, bilinear or by averaging squares of pixels.
 
-Materials and light are linear, images are sRGB, and so is the mixture of object and background in a pixel.  The curve
-and its inverse are a line near 0 and a power above.  Where the line is used, the power gets a harmless input, so values
-and gradients are finite at 0 and below.
+Materials and light are linear.  Images are sRGB, and object and background are mixed in sRGB.  The curve and its
+inverse are a line near 0 and a power above.  Where the line is used, the power gets a harmless input, so values and
+gradients are finite at 0 and below.
 """
 
 import dataclasses
@@ -62,20 +62,20 @@ def _part(x: Array, axis: int, first: int, end: int) -> Array:
 
 
 def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
-    """The mean of each square of side x side pixels."""
+    """The mean over each square of side x side pixels."""
     *batch, height, width, features = x.shape
     return jnp.mean(x.reshape(*batch, height // side, side, width // side, side, features), axis=(-4, -2))
 
 
 def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
-    """A square of side x side pixels from the features of each pixel."""
+    """Rearranges the features of each pixel to a square of side x side pixels (depth to space)."""
     *batch, height, width, features = x.shape
     x = jnp.swapaxes(x.reshape(*batch, height, width, side, side, features // side**2), -4, -3)
     return x.reshape(*batch, side * height, side * width, features // side**2)
 
 
 def enlarge(rendering: Rendering, height: int, width: int) -> Rendering:
-    """The rendering at a larger size: colours by cubics, depth and opacity between their neighbours."""
+    """The rendering at a larger size: colours by cubic interpolation, depth and opacity by linear interpolation."""
     color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
     depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
     return dataclasses.replace(rendering, image=color, image_lr=color, depth=depth, acc=acc)

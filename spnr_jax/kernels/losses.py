@@ -1,4 +1,4 @@
-"""Losses of the training; each function returns a mean over all elements of its input."""
+"""Training losses; each function returns a mean over all elements of its input."""
 
 from collections.abc import Callable
 
@@ -41,7 +41,7 @@ def r1(
 def area_downsample(
     image: Float[Array, "*batch height width features"], size: int
 ) -> Float[Array, "*batch {size} {size} features"]:
-    """Image averaged over equal squares; pixels that straddle a border count by their covered share."""
+    """Image averaged over equal squares; a pixel that straddles a border counts by the share covered."""
 
     def coverage(n: int) -> Float[Array, "size n"]:
         start = jnp.arange(size, dtype=jnp.float32)[:, None] * (n / size)

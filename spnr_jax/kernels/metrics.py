@@ -13,7 +13,7 @@ from spnr_jax.kernels.numerics import safe_divide
 
 PSNR_CAP = 100.0  # dB, of identical images
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # gaussian window of Wang et al. 2004, cut at 3.5 sigma as scikit-image does
-SILENT = 1e-10  # spectral energy a pixel below which there is only rounding; 8-bit steps have 5e-7
+SILENT = 1e-10  # spectral energy per pixel below which there is only rounding; 8-bit steps have 5e-7
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
@@ -34,7 +34,7 @@ def conditional_psnr(
     reference: Float[Array, "*batch height width 3"],
     mask: Bool[Array, "*batch height width"],
 ) -> Float[Array, "*batch"]:
-    """PSNR over the condition pixels alone, where a visible input point lies; NaN if there is none (skip and count)."""
+    """PSNR over the condition pixels, at which a visible input point lies; NaN if there is none (skip and count it)."""
     squared = jnp.sum(jnp.where(mask[..., None], (image - reference) ** 2, 0), axis=(-3, -2, -1))
     count = 3 * jnp.sum(mask, axis=(-2, -1))
     return jnp.where(count > 0, _decibel(safe_divide(squared, count.astype(squared.dtype))), jnp.nan)
@@ -52,7 +52,7 @@ def ssim(
     taps = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
     taps = (taps / taps.sum()).tolist()
 
-    def blur(x):  # the border, where the window leaves the image, is cut off
+    def blur(x):  # the border, where the window extends beyond the image, is cropped
         for axis in (x.ndim - 3, x.ndim - 2):
             shifted = (jax.lax.slice_in_dim(x, i, x.shape[axis] - 2 * SSIM_RADIUS + i, axis=axis) for i in range(11))
             x = sum(tap * part for tap, part in zip(taps, shifted, strict=True))
@@ -69,7 +69,7 @@ def ssim(
 def opacity_iou(
     acc: Float[Array, "*batch height width"], alpha: Float[Array, "*batch height width"]
 ) -> Float[Array, "*batch"]:
-    """Intersection over union of the pixels that are more than half opaque; 1 where both have none."""
+    """Intersection over union of the pixels that are more than half opaque; 1 if neither image has any."""
     ours, theirs = acc > 0.5, alpha > 0.5
     union = jnp.sum(ours | theirs, axis=(-2, -1))
     return jnp.where(union > 0, safe_divide(1.0 * jnp.sum(ours & theirs, axis=(-2, -1)), 1.0 * union), 1.0)

@@ -1,8 +1,8 @@
-"""The few delicate primitives that the other kernels share: functions of numbers and vectors, small linear systems.
+"""Numerically delicate primitives that other kernels share: functions of numbers and vectors, small linear systems.
 
-Vectors are the last axis.  Sums, systems and eigenvectors with a few unknowns, one for each point, have the points as
-the last axis instead: every step is one pass over all points of a block, which a CPU vectorises; LAPACK and batched
-matrix products take ten times as long.  Subnormal numbers (below 1.2e-38) are zeros to XLA.
+Vectors are the last axis.  In sums, systems and eigenvectors with few unknowns per point, the points are the last axis
+instead: every step is one pass over all points of a block, which a CPU vectorises; LAPACK and batched matrix products
+take ten times as long.  XLA flushes subnormal numbers (below 1.2e-38) to zero.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ LOG1P = (
 def safe_divide(numerator: Float[Array, "*batch"], denominator: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """numerator / denominator, and 0 where the denominator is 0; finite in value and gradient there.
 
-    Elsewhere it is the quotient: gradients by denominators below 1e-19 overflow, as 1 / denominator^2 does.
+    Elsewhere it is the quotient; its gradient by denominators below 1e-19 overflows, as 1 / denominator^2 does.
     """
     valid = denominator != 0
     return jnp.where(valid, numerator / jnp.where(valid, denominator, 1), 0)
@@ -58,7 +58,7 @@ def _softplus_jvp(primals, tangents):
 def one_minus_exp(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """1 - exp(-x), exact for small x too; gradient exp(-x).
 
-    JAX's derivative of expm1 adds 1 to its value, which leaves no digit of it from x = 17 on.
+    JAX's derivative of expm1 adds 1 to its value, which loses all digits for x above 17.
     """
     return -jnp.expm1(-x)
 
@@ -71,39 +71,39 @@ def _one_minus_exp_jvp(primals, tangents):
 def clamp(
     x: Float[Array, "*shape"], low: Float[Array, "*shape"] | float | int, high: Float[Array, "*shape"] | float | int
 ) -> Float[Array, "*shape"]:
-    """x between low and high, jnp.clip with a gradient that is always that of x, of low or of high.
+    """x between low and high: jnp.clip with a gradient that is always that of exactly one of x, low and high.
 
-    jnp.clip asks in its gradient whether x equals the result; a compiler that computes x twice, once with a fused
-    multiply-add, answers no and loses the gradient of some elements.
+    The gradient of jnp.clip tests whether x equals the result.  A compiler that computes x twice, once with a fused
+    multiply-add, finds them different and loses the gradient of some elements.
     """
     return jnp.where(x < low, low, jnp.where(x > high, high, x))
 
 
 def larger(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
-    """The larger of two, jnp.maximum with a gradient that is always that of one of them (as in `clamp`)."""
+    """The larger of two: jnp.maximum with a gradient that is always that of one of them (as in `clamp`)."""
     return jnp.where(a > b, a, b)
 
 
 def smaller(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
-    """The smaller of two, likewise."""
+    """The smaller of two, with the same property."""
     return jnp.where(a < b, a, b)
 
 
 def root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Square root; 0 with zero gradient where x is 0 or, by rounding, below."""
+    """Square root; 0 with zero gradient where x is 0 or, by rounding, negative."""
     valid = x > 0
     return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
 
 
 def namespace(*values: Any) -> ModuleType:
-    """jax.numpy if any of the values is an array of JAX, traced or not; NumPy, which compiles nothing, otherwise."""
+    """jax.numpy if any value is a JAX array, traced or not; otherwise NumPy, which compiles nothing."""
     return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
 def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
-    """The features one by one; their gradients are put side by side once, where those of slices are padded and added.
+    """The features as separate arrays; their gradients are stacked once (gradients of slices are padded and summed).
 
-    Of twenty columns XLA's CPU compiler computes the sum of the padded ones five times as long.
+    For twenty columns, XLA's CPU compiler takes five times as long for the sum of the padded ones.
     """
     return [part[..., 0] for part in jnp.split(x, x.shape[-1], axis=-1)]
 
@@ -118,10 +118,10 @@ def rotate_columns(
 
 
 def with_gradient(function: Callable, pull_back: Callable) -> Callable:
-    """The function of arrays with the gradient `pull_back(primals, cotangents)`, for both modes of differentiation.
+    """The function with the gradient `pull_back(primals, cotangents)`, for both modes of differentiation.
 
-    `pull_back` is linear in the cotangents, a tuple as the outputs are.  A tangent is its transpose; transposed again,
-    as reverse mode does, that is `pull_back` itself, operation by operation.
+    `pull_back` is linear in the cotangents, a tuple like the outputs.  A tangent is computed by its transpose.  Reverse
+    mode transposes that again, which gives `pull_back` itself, operation by operation.
     """
     differentiable = jax.custom_jvp(function)
 
@@ -134,7 +134,7 @@ def with_gradient(function: Callable, pull_back: Callable) -> Callable:
 
 
 def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """0 below 0, 1 above 1, a cubic without a kink between."""
+    """0 below 0, 1 above 1, and a smooth cubic in between."""
     x = clamp(x, 0, 1)
     return x * x * (3 - 2 * x)
 
@@ -148,7 +148,7 @@ def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
 
 
 def length(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-    """Euclidean lengths; that of the zero vector is 0 with zero gradient."""
+    """Euclidean lengths; 0 with zero gradient for the zero vector."""
     scale = _largest(vectors)
     squared = jnp.sum((vectors / scale) ** 2, axis=-1)
     valid = squared > 0
@@ -156,27 +156,27 @@ def length(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
 
 
 def _largest(vectors):
-    """Largest component of each vector (1 of the zero vector): divided by it, squares neither overflow nor vanish.
+    """Largest component of each vector (1 for the zero vector); vectors divided by it have squares in range.
 
-    A constant to the gradient: lengths and directions do not depend on the scale that they are computed at.
+    Constant for gradients: lengths and directions do not depend on the scale that they are computed at.
     """
     largest = jnp.max(jnp.abs(jax.lax.stop_gradient(vectors)), axis=-1, keepdims=True)
     return jnp.where(largest > 0, largest, 1)
 
 
 def per_feature(vector: Shaped[Array, " features"], like: Array) -> Shaped[Array, "*ones features"]:
-    """A vector over the last axis, with as many axes as `like` (ranks are never promoted silently)."""
+    """A vector broadcast over the last axis, with as many axes as `like` (ranks are never promoted silently)."""
     return vector.reshape(*[1] * (like.ndim - 1), -1)
 
 
 # --- small systems, points last ---------------------------------------------------------------------------------------
 
 
-ROUND = 1e-4  # of the trace, added to variances before they are inverted
-SQUARINGS = 5  # after which a variance that is a tenth larger than another weighs twenty times as much
-SHORTEST = 1e-9  # vector that has a direction
-POINT = 1e-9  # trace of a covariance without extent: the square of smaller ones, which a gradient divides by, vanishes
-SMALLEST = 1e-7  # of the trace, below which a variance is rounding
+ROUND = 1e-4  # times the trace, added to variances before they are inverted
+SQUARINGS = 5  # after them, a variance a tenth larger than another weighs twenty times as much
+SHORTEST = 1e-9  # length of a vector that has a direction
+POINT = 1e-9  # least trace of a covariance with extent: gradients divide by its square, kept above 0
+SMALLEST = 1e-7  # times the trace: variances below are rounding
 
 
 def total(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
@@ -214,7 +214,7 @@ def multiply(
 
 
 def _eliminate(matrix: Array, right: Array) -> Array:
-    """Gauss-Jordan elimination, which needs no pivots for positive definite systems."""
+    """Gauss-Jordan elimination; positive definite systems need no pivoting."""
     places = jnp.arange(len(matrix))[:, None, None]
 
     def eliminate(pivot: Array, rows: Array) -> Array:
@@ -237,9 +237,9 @@ def cross(one: Float[Array, "3 points"], two: Float[Array, "3 points"]) -> Float
 
 @jax.custom_jvp
 def largest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
-    """Largest along the first axis; its gradient is the mean of those that are as large but for rounding.
+    """Largest along the first axis; its gradient is the mean over those that are equal to it up to rounding.
 
-    That of jnp.max asks which equal the result: a compiler that computes them twice finds none, and divides by 0.
+    The gradient of jnp.max tests equality with the result: a compiler that computes both finds none, and divides by 0.
     """
     return jnp.max(values, axis=0)
 
@@ -254,12 +254,12 @@ def _largest_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
 
 
 def smallest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
-    """Smallest along the first axis, likewise."""
+    """Smallest along the first axis, with the same property."""
     return -largest(-values)
 
 
 def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
-    """Vectors of length 1; 0 where they are shorter than SHORTEST, whose gradient overflows."""
+    """Vectors scaled to length 1; 0 where they are shorter than SHORTEST, as the gradient would overflow."""
     squared = jnp.sum(vectors * vectors, axis=0, keepdims=True)
     valid = squared > SHORTEST**2
     return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
@@ -276,9 +276,9 @@ def frame(normal: Float[Array, "3 points"]) -> Float[Array, "3 3 points"]:
 
 
 def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 points"]:
-    """Onto the eigenvector of the largest eigenvalue of positive matrices: their powers, of trace 1.
+    """Projections onto the eigenvector of the largest eigenvalue of positive matrices, from powers of trace 1.
 
-    Where two are alike it is a mean of both projections, so it is smooth, as its gradient is.
+    For nearly equal eigenvalues the result is a smooth mean of both projections, with a smooth gradient.
     """
 
     def square(_: Array, power: Array) -> Array:
@@ -292,7 +292,7 @@ def project_largest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 3 poi
 def split_variances(
     matrix: Float[Array, "3 3 points"],
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "3 3 points"], Float[Array, "3 3 points"]]:
-    """Covariances at trace 1 (0 without extent), projections onto the narrowest axis and onto the widest."""
+    """Covariances scaled to trace 1 (0 without extent), projections onto the narrowest and onto the widest axis."""
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     extended = trace > POINT
     scaled = jnp.where(extended[None, None], matrix / jnp.where(extended, trace, 1)[None, None], 0)
@@ -303,7 +303,7 @@ def split_variances(
 
 
 def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points"]:
-    """Unit vectors, of either sign, along which points with these covariances spread least."""
+    """Unit vectors, of either sign, along which points with these covariances have the least variance."""
     _, (x, y, z), _ = split_variances(matrix)
     last = jnp.where(y[1] > z[2], y, z)
     return unit(jnp.where((x[0] > y[1]) & (x[0] > z[2]), x, last))

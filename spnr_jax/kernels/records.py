@@ -1,8 +1,8 @@
 """The records that travel between kernels: pytrees of arrays, data only.
 
-Every record may carry leading batch axes on all of its arrays (`*batch`); axis words are those of the README:
-batch objects views points rays samples height width features.  Colours of materials are linear RGB, images are sRGB
-in [0, 1].  Image sizes are static fields because they shape arrays.
+Every record may carry leading batch axes on all of its arrays (`*batch`).  Axes are named batch, objects, views,
+points, rays, samples, height, width, features.  Colours of materials are linear RGB, images are sRGB in [0, 1].  Image
+sizes are static fields because they shape arrays.
 """
 
 from typing import Any, no_type_check
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from spnr_jax.kernels.numerics import namespace
 
 AnyArray = jax.Array | np.ndarray
-LARGEST_REACH = 4  # voxels around points that rays look at, at most
+LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
 
 
 @no_type_check  # pytree transformations rebuild records with leaves that are no arrays
@@ -41,7 +41,7 @@ class PointCloud:
 class Camera:
     """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels.
 
-    The size is static: arrays have it.  Only inside a program may it be traced.
+    `height` and `width` are static, because they shape arrays; inside a program they may be traced.
     """
 
     cam_to_world: Float[AnyArray, "*batch 3 4"]
@@ -62,7 +62,7 @@ class Rays:
 @no_type_check
 @struct.dataclass
 class Rendering:
-    """What a camera sees: `image` after the upsampler, the rest at the resolution of the volume rendering.
+    """The result of a rendering: `image` after the upsampler, the rest at the resolution of the volume rendering.
 
     `depth` is the expected distance along the ray (the far side of the box where nothing is hit), `acc` the opacity.
     """
@@ -89,7 +89,7 @@ class Scene:
 class Volume:
     """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
-    `scene` is what the network encodes a cloud as: of the paper's network a `Scene`, of surfels a `SurfelScene`.
+    `scene` is the network's encoding: a `Scene` for the paper's network, a `SurfelScene` for surfels.
     """
 
     scene: Any
@@ -102,15 +102,15 @@ class Volume:
 @no_type_check
 @struct.dataclass
 class Surfels:
-    """Surface elements of one object (`surfels/geometry.py`): discs with materials, padded; zeros where mask is False.
+    """Surface elements of one object (`surfels/geometry.py`): discs with materials; zeros where `mask` is False.
 
-    `spacing` is the side of the square that a point stands for, in units of the box; `jump` what is added to the
-    colour beyond `border`, which is the unit vector across a line in the disc's plane and how far from the point that
-    lies (0 without one); `sided` is close to 1 where one side is outside, 0 where both are; `visible` how much each of
-    64 directions sees; `shape` the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
-    point along `rim`, a unit vector in its plane, against it, and along and against their cross product normal x rim.
-    `guessed` is 1 where roughness and metallic are not known, `invented` 0 where the point was measured, and above 0
-    where it was learned (`method/densifier.py`).
+    `spacing` is the side of the square that a point represents, in units of the box.  `border` is a line in the disc's
+    plane: a unit vector across it and its distance from the point (0: none); `jump` is added to the colour beyond it.
+    `sided` is near 1 where one side is outside, 0 where both are.  `visible` is the visibility from each of 64
+    directions. `shape` is the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
+    point along `rim` (a unit vector in its plane), against it, along normal x rim and against that.  `guessed` is 1
+    where roughness and metallic are unknown, `invented` 0 for a measured point and above 0 for a learned one
+    (`method/densifier.py`).
     """
 
     position: Float[AnyArray, "*batch points 3"]
@@ -134,10 +134,10 @@ class Surfels:
 @no_type_check
 @struct.dataclass
 class SurfelScene:
-    """An encoded object of the network over surfels: arrays alone, so scenes of equally padded clouds stack.
+    """An encoded object of the surfel network; arrays only, so scenes of equally padded clouds can be stacked.
 
-    The surfels lie in the box [-1, 1]^3, which is (position - centre) * scale of the cloud; `spacing` is the median of
-    theirs, in the box, and decides at what size a picture is drawn.
+    The surfels lie in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.  `spacing` is their median
+    spacing in the box; it determines the resolution of the G-buffer.
     """
 
     surfels: Surfels
@@ -149,34 +149,34 @@ class SurfelScene:
 @no_type_check
 @struct.dataclass
 class Light:
-    """Light from all around, as tables by direction, every one linear in the environment map (`surfels/lighting.py`).
+    """Distant light as tables by direction, all linear in the environment map (`surfels/lighting.py`).
 
-    `tables[0]` is the irradiance over pi of a surface by its normal, `tables[1:]` what a surface of each of the
-    roughnesses LEVELS mirrors by the mirrored direction; `tables[1]` is the map itself.
+    `tables[0]` is the irradiance / pi by normal.  `tables[1:]` are the prefiltered radiances by mirrored direction, one
+    for each of the roughnesses LEVELS; `tables[1]` is the map itself.
     """
 
     tables: Float[AnyArray, "7 32 64 3"]
 
     def __add__(self, other: "Light") -> "Light":
-        """Both lights together."""
+        """The sum of both lights."""
         return Light(tables=self.tables + other.tables)
 
     def __mul__(self, factor: float | int) -> "Light":
-        """The light so many times as bright."""
+        """The light with its radiance multiplied by a factor."""
         return Light(tables=factor * self.tables)
 
     __rmul__ = __mul__
 
     def turned(self, degrees: float | int | jax.Array) -> "Light":
-        """The light turned about the up axis: what stood at an azimuth (0 at +z, 90 at +x) stands so much further.
+        """The light rotated about the up axis: an azimuth (0 at +z, 90 at +x) increases by `degrees`.
 
-        Exact for multiples of a texel, 5.625 degrees; between them neighbours are mixed.  The angle may be traced.
+        Exact for multiples of a texel, 5.625 degrees; otherwise texels are interpolated.  The angle may be traced.
         """
         xp = namespace(degrees)
-        columns = -degrees / 360 * self.tables.shape[-2]  # azimuths run against them
+        columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
         part = columns - whole
-        # indices: jnp.roll is compiled anew for every whole number
+        # indices: jnp.roll would be compiled for every shift
         places = xp.arange(self.tables.shape[-2]) - whole.astype(int)
         near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
@@ -185,12 +185,12 @@ class Light:
 @no_type_check
 @struct.dataclass
 class GBuffer:
-    """What the front-most surfels say at each pixel of a picture: blends of their attributes, camera axes for vectors.
+    """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes.
 
-    `opacity` is that of all surfels along the ray, `coverage` the summed weights of those in front, `depth` along the
-    camera's axis, `spread` its standard deviation, `color` to first order, the rest blended with the wider kernel.
-    `centres` are the summed weights of the narrower one, `beside` how far its discs' centres lie from the pixel's, in
-    pixels.  Where nothing is drawn all is 0.
+    `opacity` is that of all surfels along the ray, `coverage` the summed weights of the front-most.  `depth` is along
+    the camera's axis, `spread` its standard deviation.  `color` is blended with the narrower weights, the rest with the
+    wider ones.  `centres` sums the narrower weights; `beside` is the mean offset of the discs' centres from the
+    pixel's, in pixels.  All fields are 0 at pixels without discs.
     """
 
     opacity: Float[Array, "height width"]
@@ -208,7 +208,7 @@ class GBuffer:
 @no_type_check
 @struct.dataclass
 class Batch:
-    """One training batch: clouds of `objects`, and `views` of each with reference, its opacity, and condition image."""
+    """One training batch: clouds of `objects`, and `views` of each with reference, opacity, and condition image."""
 
     cloud: PointCloud
     camera: Camera
@@ -221,10 +221,10 @@ class Batch:
 @no_type_check
 @struct.dataclass
 class Crops:
-    """One training batch of the shader network: squares of G-buffers as it sees them (`nn/shader.py`).
+    """One training batch of the shader network: crops of G-buffers as network inputs (`nn/shader.py`).
 
-    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution; `seen` reaches
-    `margin` pixels beyond it and the maps to each side.
+    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `seen` extends
+    `margin` pixels beyond it and beyond the light maps on each side.
     """
 
     seen: Float[AnyArray, "crops rows columns 33"]
@@ -240,9 +240,9 @@ class Crops:
 class Gaussians:
     """Gaussian splats of one object, as `spnr_jax/surfels/gaussians.py` makes them and splat viewers draw them.
 
-    Splat i is exp(-d^T C^-1 d / 2) times its opacity, with C = R S^2 R^T of its rotation (a unit quaternion, w x y z)
-    and its scales, standard deviations along its own axes, the third along the normal.  Its colour from the direction
-    eye -> splat is sRGB, 0.5 plus the sum of `harmonics` times the real spherical harmonics of surfels/gaussians.py.
+    Splat i is its opacity times exp(-d^T C^-1 d / 2), with C = R S^2 R^T from its rotation (a unit quaternion, w x y z)
+    and scales (standard deviations along its axes; the third is the normal).  Its colour in the direction eye -> splat
+    is sRGB: 0.5 plus the sum of `harmonics` times the real spherical harmonics of surfels/gaussians.py.
     """
 
     position: Float[AnyArray, "splats 3"]
@@ -256,5 +256,5 @@ Key = jax.Array
 
 
 def unstack(tree: Any) -> list[Any]:
-    """What lies at each place of the first axis of a tree's arrays."""
+    """The elements of a pytree of arrays along the first axis."""
     return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(len(jax.tree.leaves(tree)[0]))]

@@ -1,9 +1,9 @@
 """Where along a ray the volume is evaluated: stratified samples, and samples drawn from a step function.
 
 Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `distances` (*batch, m) are samples,
-`weights` (*batch, n) is the mass of each bin.  One key draws a number per sample of every ray; an array of keys
-(*batch) has one key per ray; key=None takes the middle of each stratum.  All of it is float32: one bf16 spacing is
-wider than a coarse bin.
+`weights` (*batch, n) are the masses of the bins.  One key draws a number per sample of every ray; an array of keys
+(*batch) has one key per ray; key=None takes the middle of each stratum.  Everything is float32: a bf16 spacing is wider
+than a coarse bin.
 """
 
 import jax
@@ -23,7 +23,7 @@ def strata(key: Key | None, shape: tuple[int, ...], num_samples: int) -> Float[A
 
 
 def split(key: Key) -> tuple[Key, Key]:
-    """Two new keys of each key."""
+    """Two new keys for each key."""
     key = as_typed_key(key)
     if key.ndim:
         return jax.vmap(split)(key)
@@ -32,7 +32,7 @@ def split(key: Key) -> tuple[Key, Key]:
 
 
 def as_typed_key(key: Key) -> Key:
-    """The key, or keys; those of `jax.random.PRNGKey`, pairs of numbers, as ones of `jax.random.key`."""
+    """Typed keys (`jax.random.key`); raw ones of `jax.random.PRNGKey`, pairs of numbers, are wrapped."""
     return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
 
 
@@ -48,7 +48,7 @@ def stratified(
     near, far = near[..., None], far[..., None]
     steps = jnp.arange(num_samples + 1, dtype=jnp.promote_types(near.dtype, jnp.float32))
     fractions = per_feature(steps / num_samples, near)
-    edges = near + (far - near) * fractions  # rises with the fractions, whatever is rounded
+    edges = near + (far - near) * fractions  # rises with the fractions under any rounding
     edges = jnp.where((fractions < 1) & (edges < far), edges, far)
     at = strata(key, near.shape[:-1], num_samples)
     return clamp(near + (far - near) * at, edges[..., :-1], edges[..., 1:]), edges
@@ -63,9 +63,8 @@ def importance(
 ) -> Float[Array, "*batch {num_samples}"]:
     """Sorted distances inside the edges, distributed as the step function `weights + padding` (NeRF, section 5.2).
 
-    Inverts the cumulative distribution at one number of each of num_samples strata.  All-zero weights give an even
-    spread.  No gradient: the samples are where to look, not what is seen; through them the coarse weights would be
-    pulled towards whatever the fine samples happen to find.
+    Inverts the cumulative distribution at one number in each of num_samples strata.  With all-zero weights the samples
+    are evenly distributed.  No gradient: it would pull the coarse weights towards whatever the fine samples find.
     """
     if weights.shape[-1] + 1 != edges.shape[-1]:
         raise UserError(f"importance: {edges.shape[-1]} edges have one weight less, got {weights.shape[-1]} weights")
@@ -83,13 +82,13 @@ def importance(
 def merge(
     first: Float[Array, "*batch n"], second: Float[Array, "*batch m"]
 ) -> tuple[Int[Array, "*batch n+m"], Int[Array, "*batch n+m"]]:
-    """(order, rank) of two sorted lists laid end to end: `both[order]` is sorted, and `sorted[rank]` is both again.
+    """(order, rank) of two concatenated sorted lists: `both[order]` is sorted, and `sorted[rank]` is `both` again.
 
-    Equal numbers keep the first list's first.  Counting what is smaller takes an eighth of a sort's time on CPU.
+    For equal numbers, the first list comes first.  Counting smaller numbers takes an eighth of a sort's time on a CPU.
     """
     n, m = first.shape[-1], second.shape[-1]
     place_first, place_second, place = (per_feature(jnp.arange(k, dtype=jnp.int32), first) for k in (n, m, n + m))
-    # without barriers XLA computes the ranks anew inside each gather that reads them
+    # without barriers XLA recomputes the ranks inside each gather that reads them
     barrier = jax.lax.optimization_barrier
     rank_first = barrier(place_first + count_at_most(second, first, strictly=True))
     rank_second = barrier(place_second + count_at_most(first, second))
@@ -103,7 +102,7 @@ def merge(
 def count_at_most(
     sorted_values: Shaped[Array, "*batch n"], queries: Shaped[Array, "*batch m"], strictly: bool = False
 ) -> Int[Array, "*batch m"]:
-    """How many of the sorted values are <= (strictly: <) each query: one by one for few values, else by bisection."""
+    """Number of sorted values <= (strictly: <) each query; by comparing all for few values, else by bisection."""
     n = sorted_values.shape[-1]
     count = jnp.zeros(queries.shape, jnp.int32)
     if n <= 256:

@@ -3,9 +3,9 @@
     voxel       side of the cubes that hold CROWD points on average: about three spacings, for any pattern of points
     clusters    connected components of voxels that share a face, an edge or a corner
     plane       RANSAC (Fischler and Bolles 1981) over one point of each voxel, so that area counts, not the density of
-                the scan; fitted again to the points close to it
+                the scan; refitted to its inliers
 
-NumPy in, NumPy out, nearly linear in the number of points; the seed chooses the planes that are tried.
+NumPy in, NumPy out, nearly linear in the number of points; the seed chooses the candidate planes.
 """
 
 import dataclasses
@@ -22,13 +22,13 @@ from spnr_jax.kernels.cloud_arrays import first_in_voxels, frame
 Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
 
-CROWD = 4.0  # points of a voxel, on average
+CROWD = 4.0  # points per voxel, on average
 COARSEST, FINER, TRIES = 4.0, 2**0.5, 40  # fewest voxels along the extent; ratio and number of the sides tried
 NEIGHBOURS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
-SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, planes that are tried, fits to what lies close
-CLOSE = 0.5  # voxels from the plane, for the votes
-THICK = 3.0  # standard deviations of what lies close, a voxel at most: a plane's noise goes with it
-LEAST_PLANE = 0.1  # share of the area that a plane needs
+SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, candidate planes, refits
+CLOSE = 0.5  # voxels: largest distance of an inlier from the plane
+THICK = 3.0  # standard deviations of the inliers, at most a voxel: removing the plane removes its noise
+LEAST_PLANE = 0.1  # least share of the area of a plane
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,12 +46,12 @@ class Plane:
 
 
 def in_box(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarray, " points"]:
-    """True for points between the corners xmin ymin zmin and xmax ymax zmax, borders included."""
+    """True for points in the box with corners xmin ymin zmin and xmax ymax zmax, borders included."""
     return np.all((positions >= np.asarray(box[:3])) & (positions <= np.asarray(box[3:])), axis=-1)
 
 
 def crop_box(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
-    """The line about a box, of points that lie from low (3,) to high (3,); ValueError if it holds none of them."""
+    """The message about a cropped box whose points lie from low (3,) to high (3,); ValueError if it is empty."""
     if not kept:
         asked = " ".join(f"{value:g}" for value in box)
         raise UserError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_format_box(low, high)}")
@@ -59,7 +59,7 @@ def crop_box(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) 
 
 
 def _format_box(low: np.ndarray, high: np.ndarray) -> str:
-    """A box as --crop takes it, to a thousandth of its size."""
+    """A box in the format of --crop, rounded to a thousandth of its size."""
     size = float(np.max(high - low, initial=np.finfo(np.float64).tiny))
     decimals = int(np.clip(3 - np.floor(np.log10(size)), 0, 12))
     return " ".join(f"{value + 0.0:.{decimals}f}" for value in (*low, *high))
@@ -72,10 +72,9 @@ def object_of(
     nth: int | None,
     seed: int,
 ) -> tuple[Int[np.ndarray, " left"], list[str]]:
-    """Rows of what is left without the dominant plane, of that the nth largest cluster (None: all); a line for each.
+    """Rows of the points that remain without the dominant plane and in the nth largest cluster (None: all); messages.
 
-    Lines say places as positions + origin.  ValueError where there is no such plane, or nothing beside it, or not so
-    many clusters.
+    Messages give positions as positions + origin.  ValueError without such a plane, another point, or such a cluster.
     """
     rows, lines = np.arange(len(positions)), []
     if remove_plane:
@@ -105,7 +104,7 @@ def object_of(
 def voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
     """Side of the finest voxels that hold CROWD points on average."""
     corner, extent = frame(positions)
-    coarse, fine = 0, TRIES  # steps; the first is taken whatever it holds
+    coarse, fine = 0, TRIES  # steps; the first is accepted whatever it holds
     while fine - coarse > 1:
         step = (coarse + fine) // 2
         crowded = len(positions) >= CROWD * len(first_in_voxels(positions - corner, extent / COARSEST / FINER**step))
@@ -114,9 +113,9 @@ def voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
 
 
 def clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
-    """The number of each point's cluster: 0 of the largest, 1 of the next.  `voxel` is voxel_side unless given.
+    """The cluster index of each point, 0 for the largest; `voxel` is voxel_side by default.
 
-    Clusters of equally many points are numbered in the order of their first points.
+    Ties in size are broken by the order of the clusters' first points.
     """
     x, y, z = (_slices(axis, voxel or voxel_side(positions)) for axis in positions.T)
     deep, wide = int(z.max()) + 2, int(y.max()) + 2
@@ -139,13 +138,13 @@ def clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = Non
 
 
 def _slices(axis: np.ndarray, voxel: float) -> np.ndarray:
-    """Numbers (points,) from 1 of the slices along an axis; empty ones between two count once, however many."""
+    """Indices (points,) from 1 of the slices along an axis; a gap of empty slices counts as one."""
     found, rows = np.unique(np.floor((axis - axis.min()) / voxel), return_inverse=True)
     return 1 + np.concatenate([[0], np.cumsum(np.minimum(np.diff(found), 2))]).astype(np.int64)[rows]
 
 
 def dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> Plane | None:
-    """The plane with most of the surface close to it; None if that is less than LEAST_PLANE of it."""
+    """The plane with most of the surface near it; None if that is less than LEAST_PLANE of the area."""
     voxel = voxel_side(positions)
     corner, _ = frame(positions)
     rng = np.random.default_rng(seed)

@@ -1,17 +1,17 @@
-"""Points to volume and back (scatter by voxel, trilinear lookup), and empty-space skipping.
+"""Points to volume and back (scatter to voxels, trilinear lookup), and empty-space skipping.
 
-A scatter is a sum: each point adds 1 / (points in its voxel) of its features to the voxel's mean (`spread`).
-`gather_rows` and `scatter_rows` are each other's transpose.  Both flatten mapped axes into one longer table under vmap:
+A scatter is a sum: each point adds its features, over the number of points in its voxel, to the voxel (`spread`).
+`gather_rows` and `scatter_rows` are each other's transpose.  Under vmap both flatten the mapped axes into one table:
 XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3 voxels, 2 objects).  On a
-mesh there is one table for each group of objects: in a common one XLA would not know that rows stay on their device.
+device mesh there is a table per group of objects; in a common one XLA could not know that rows stay on their device.
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
 centres lie at i + 0.5.  Leading batch axes pair a volume with its positions.
 
-A ray is cut into equal cells; those with their middle in a voxel near points are `open` (occupied segments).
-`travelled` is the length of the open cells up to a place: samples lie in the concatenated segments, so that none falls
-into a gap, and a gap adds no interval length.  Density is 0 outside, by definition.
+A ray is cut into equal cells; cells whose middle is in a voxel near points are `open` (occupied segments).  `travelled`
+is the length of the open cells up to a distance.  Samples lie in the concatenated open segments, so none falls into a
+gap, and a gap adds no interval length.  Outside the open cells, density is 0 by definition.
 """
 
 import itertools
@@ -36,13 +36,13 @@ NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-
 
 
 def _end_to_end(function, table, index, *values):
-    """`function` of mapped tables (b, rows, c) as one table (b * rows, c), and of indices (b, *shape) into that."""
+    """`function` of mapped tables (b, rows, c), concatenated to (b * rows, c), and of indices (b, *shape) into that."""
     offsets = table.shape[1] * jnp.arange(len(table), dtype=index.dtype).reshape(-1, *[1] * (index.ndim - 1))
     return function(table.reshape(-1, *table.shape[2:]), index + offsets, *values)
 
 
 def _by_group(function, plain, *arguments):
-    """`function` of the tables of all objects end to end; on a mesh `plain` of those of each group of objects."""
+    """`function` of the concatenated tables of all objects; on a device mesh, `plain` of those of each group."""
     groups = object_groups(len(arguments[0]))
     if groups == 1:
         return _end_to_end(function, *arguments)
@@ -170,12 +170,12 @@ def voxel_of(positions: Float[Array, "*batch"], resolution: int) -> Int[Array, "
 
 
 def row_of(cell: Int[Array, "*batch 3"], valid: Bool[Array, "*batch"], resolution: int) -> Int[Array, "*batch"]:
-    """Row of each voxel in the flattened volume; what is not valid goes to the spare row resolution ** 3."""
+    """Row of each voxel in the flattened volume; invalid voxels go to the spare row resolution ** 3."""
     return jnp.where(valid, row_at(cell[..., 0], cell[..., 1], cell[..., 2], resolution), resolution**3)
 
 
 def row_at(x: Int[Array, "*batch"], y: Int[Array, "*batch"], z: Int[Array, "*batch"], resolution: int):
-    """Row of the voxel at x, y, z in the flattened volume, of their shape."""
+    """Row of the voxel x, y, z in the flattened volume, with the shape of x."""
     return (z * resolution + y) * resolution + x
 
 
@@ -201,7 +201,7 @@ def spread(
     mask: Bool[Array, " points"],
     resolution: int,
 ) -> tuple[Int[Array, " points"], Float[Array, "points features+1"]]:
-    """Rows of the flattened volume, and what each point adds there to the means of features and to occupancy."""
+    """Rows of the flattened volume, and each point's contribution to the means of features and to occupancy."""
     rows, valid = voxel_rows(positions, mask, resolution)
     ones = valid.astype(positions.dtype)
     count = gather_rows(scatter_rows(rows, ones[:, None], resolution**3 + 1), rows)[:, 0]
@@ -232,13 +232,13 @@ def scatter_conv(
     kernel: Float[Array, "3 3 3 features out"],
     resolution: int,
 ) -> Float[Array, "d d d out"]:
-    """3^3 convolution (zero padding) of the volume that `values` sum to, computed from the occupied voxels alone.
+    """3^3 convolution (zero padding) of the volume that `values` sum to, computed from the occupied voxels only.
 
-    The same map as convolving the scattered volume: each point adds its 27 products to the neighbours of its voxel.
-    With 1024 points 3 % of a 32^3 grid is occupied.
+    The result equals a convolution of the scattered volume: each point adds its 27 products to the neighbours of its
+    voxel.  With 1024 points 3 % of a 32^3 grid is occupied.
     """
     products = jnp.einsum("pf,tfo->pto", values, kernel.reshape(27, *kernel.shape[3:]), precision="highest")
-    # the output at voxel v reads voxel v + n through the tap of n: a point feeds the neighbours at minus n
+    # the output at voxel v reads voxel v + n through tap n: a point contributes to its neighbours at -n
     steps = -jnp.array([NEIGHBOURS], jnp.int32)
     cell = jnp.stack([rows // resolution**2, rows // resolution % resolution, rows % resolution], axis=-1)
     cell = cell[:, None] + steps
@@ -253,10 +253,10 @@ def trilinear(
     positions: Float[Array, "*batch 3"],
     objects: Int[Array, "*batch"] | None = None,
 ) -> Float[Array, "*batch features"]:
-    """Features between the eight nearest voxel centres; zero outside [-1, 1]^3.
+    """Features interpolated between the eight nearest voxel centres; zero outside [-1, 1]^3.
 
-    The first axes of the positions are the objects of the volume, unless `objects` gives each position's.  Within half
-    a voxel of the border the lookup takes the outermost centres.
+    The first axes of the positions are the objects of the volume, unless `objects` gives each position's
+    object.  Within half a voxel of the border, the outermost centres are used.
     """
     if volume.ndim > 4 and objects is None:
         return jax.vmap(trilinear)(volume, positions)
@@ -320,8 +320,8 @@ def open_path(
 ) -> Path:
     """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient.
 
-    With `objects`, which says to which object each ray belongs, the rays have any axes.  A cell is as open as the voxel
-    of its middle; on a face between two voxels, rounding decides which.
+    With `objects`, the object of each ray, the rays may have any axes.  A cell is open if the voxel at its middle is
+    near points; on a face between two voxels, rounding decides.
     """
     if near_points.ndim > 3 and objects is None:
         return jax.vmap(partial(open_path, num_cells=num_cells))(near_points, rays, near, far)
@@ -336,20 +336,20 @@ def open_path(
     )
     first = 0 if objects is None else objects[..., None] * resolution**3
     is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), first + row_at(x, y, z, resolution))[..., 0]
-    # equal cells are counted, in a product: a running sum takes a CPU longer, docs/lab/cpu_forms.md
+    # count equal cells by a matrix product: a running sum is slower on a CPU, docs/lab/cpu_forms.md
     count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
     return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
 
 
 def whole_path(near: Float[Array, "*batch"], far: Float[Array, "*batch"]) -> Path:
-    """All of the ray between near and far, as one open cell."""
+    """The whole ray between near and far as one open cell."""
     return Path(edges=jnp.stack([near, far], axis=-1), travelled=jnp.stack([jnp.zeros_like(near), far - near], axis=-1))
 
 
 def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:
-    """Distance along the ray with so much open length behind it; the end of a cell, not the start of the next.
+    """Distance along the ray at which the open length is `travelled`; at a gap, the end of the cell in front of it.
 
-    What exceeds the open length of the ray ends at the last edge.
+    Values beyond the open length of the ray end at the last edge.
     """
     ends = path.travelled[..., 1:]
     if ends.shape[-1] == 1:
@@ -361,15 +361,15 @@ def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[
 
 
 def map_existing(function: Callable, exists: Bool[Array, " rows"], inputs: Any, empty: Any, block: int) -> Any:
-    """`function` of the rows of the inputs that exist, `empty`'s rows for the others, `block` rows at a time.
+    """`function` of the rows of the inputs that exist and `empty` for the others, `block` rows at a time.
 
-    Blocks beyond the last existing row are skipped: time follows what there is, memory is that of a block.  The
-    gradient computes a block again rather than keep what it computed.
+    Blocks beyond the last existing row are skipped: time depends on the existing rows, memory on the block.  For the
+    gradient a block is computed again, instead of stored.
     """
     total = exists.shape[0]
     block = min(block, total)
     size = total + -total % block
-    (order,) = jnp.nonzero(exists, size=size, fill_value=total)  # what exists comes first; `total` is no row
+    (order,) = jnp.nonzero(exists, size=size, fill_value=total)  # existing rows first; `total` is no row
     count = jnp.sum(exists)
 
     @jax.checkpoint

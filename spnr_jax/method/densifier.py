@@ -1,15 +1,14 @@
 """Learned points between the points of a sparse cloud: a network over pairs of neighbors.
 
-    propose    pairs of neighbors without a point between them, and open places beside points: rims, legs, gaps
-    place      the middle of the curve through both ends at right angles to their normals (Vlachos et al. 2001), and
-               a frame there
-    predict    graph convolutions over the points, then a PointNet over those around each place, in its frame: offset
-               of the surface from there, its normal, whether it exists, whose material it has
-    choose     likely children that are not too close to better ones
+    propose    candidates: pairs of neighbors without a point between them; open places at rims, legs and gaps
+    place      middle of a pair's curved edge (PN triangles, Vlachos et al. 2001), and a local frame there
+    predict    graph convolutions over the points, then a PointNet over the points around each candidate, in its frame:
+               offset to the surface, normal, probability that the point exists, and material weights
+    choose     keep the likely children that are not too close to better ones
 
-All inputs are relative: lengths in spacings, vectors in frames that rotate with the cloud, so the children rotate with
-the cloud, too.  The neighbors come from the host.  The choices of pairs, of points around them, and of children have no
-gradient; places, normals and materials are differentiable.
+The network is rotation-equivariant: lengths are in spacings, vectors in frames that rotate with the cloud.  The
+neighbors come from the host.  The choice of pairs, of the points around them and of children has no gradient;
+positions, normals and materials are differentiable.  A *child* is a learned point; an *end* is a point of a pair.
 """
 
 import dataclasses
@@ -27,29 +26,29 @@ from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
 
-MOST_POINTS = 32768  # of a cloud that gets children
-SPARSE = 8192  # points, up to which it gets them everywhere, from there on where it ends or bends alone
-BENT = 0.3  # spacings that both ends of a pair lie off each other's planes, and what the cosine lacks of 1
-CHILDREN = 6  # of a point: in the middle of its pairs, each of which belongs to one of its ends, and at open places
-AROUND = 16  # points that tell a child
-BETWEEN = 0.4  # cosine: a point that sees both ends at an angle whose cosine is less than -BETWEEN lies between them
-ACROSS = 0.8  # sine of the slope of a pair over both tangent planes, from which on it goes through a wall
-LONGEST, SHORTEST = 4.0, 0.3  # spacings between the ends of a pair
-WAYS = 6  # in each tangent plane, that may be open: the first towards the nearest neighbor
-BESIDE, NEAR = 0.75, 1.7  # cosine, and spacings, within which a neighbor takes a way
-OPEN = 0.5  # spacings to an open place
-CLOSEST = 0.2  # spacings between a child and a better one, or a measured point; twice that if they face away
-AWAY = 1.5  # squared multiple of that distance, that normals at right angles count as
-FARTHEST = 4.0  # squared multiple of that distance from measured points, from which on farther is no better
-ROUNDS = 8  # of choosing
-FEATURES, CONVOLUTIONS = 64, 3  # of points, and graph convolutions over them
-EDGE, WIDTH, HEAD = 9, 64, 128  # numbers of an edge, features of a point around a place and of a place
-BLOCK = 256  # points or places that are worked on at once: they stay in a core's cache
-LIKELY = 0.55  # probability from which on a child is kept
+MOST_POINTS = 32768  # a cloud of more points gets no children
+SPARSE = 8192  # points: up to here children are added everywhere; in larger clouds, only at rims and on curved parts
+BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
+CHILDREN = 6  # candidates of each point: middles of the pairs that it owns, then open places
+AROUND = 16  # nearest points from which a child is predicted
+BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
+ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
+LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
+WAYS = 6  # directions in each tangent plane that are tested for openness; the first points to the nearest neighbor
+BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
+OPEN = 0.5  # spacings from a point to its open place
+CLOSEST = 0.2  # spacings: a child closer than this to a measured point or to a better child is dropped
+AWAY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to CLOSEST
+FARTHEST = 4.0  # cap of that squared ratio to measured points: being farther away is no better
+ROUNDS = 8  # of the selection
+FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
+EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
+BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
+LIKELY = 0.55  # probability above which a child is kept
 
 
 class Nodes(NamedTuple):
-    """What is known of each point: colors are square roots of linear ones; traits are side, shape, and openness."""
+    """Graph nodes: `color` is the square root of the linear colour; `traits`: shape, sidedness, openness, mask."""
 
     position: Float[Array, "n 3"]
     normal: Float[Array, "n 3"]
@@ -59,10 +58,10 @@ class Nodes(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where children are looked for: two points each, the same one twice at an open place, and who is around.
+    """Candidate positions: the two ends of each (the same point twice at an open place) and the points around it.
 
-    `exists` is False for what only fills the array; rows of `frame` are unit vectors from the first to the second
-    point, across, and along the normal; `scale` is the unit of length; `around` are numbers of points, -1 for none.
+    `exists` is False for unused slots.  Rows of `frame` are unit vectors: from the first to the second end, across, and
+    along the normal.  `scale` is the unit of length; `around` are indices of points, -1 for none.
     """
 
     first: Int[Array, " m"]
@@ -75,8 +74,7 @@ class Places(NamedTuple):
 
 
 class Children(NamedTuple):
-    """A child of each place: `offset` from its middle in its frame and scale, log odds that it exists, and shares of
-    the points around it in its materials."""
+    """A child of each candidate: `offset` from its middle in its frame, log odds that it exists, material weights."""
 
     position: Float[Array, "m 3"]
     offset: Float[Array, "m 3"]
@@ -86,13 +84,13 @@ class Children(NamedTuple):
 
 
 def see(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Places]:
-    """What the network sees of a cloud in the box."""
+    """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
     nodes = describe(estimate_surfels(cloud, neighbors))
     return nodes, place(nodes, neighbors)
 
 
 def describe(surfels: Surfels) -> Nodes:
-    """The nodes of a cloud's surfels."""
+    """Node features from the surfels of a cloud."""
     position, normal, spacing, color = map(
         jnp.asarray, (surfels.position, surfels.normal, surfels.spacing, surfels.base_color)
     )
@@ -104,10 +102,10 @@ def describe(surfels: Surfels) -> Nodes:
 def propose(
     nodes: Nodes, neighbors: Int[Array, "n 20"]
 ) -> tuple[Int[Array, "n c"], Bool[Array, "n c"], Float[Array, "n c 3"]]:
-    """The other end of the pairs of each point, which exist, and ways to open places, where the other end is itself.
+    """For each point: the other ends of its pairs, which of them exist, and directions to open places (end: the point).
 
-    A pair is one of a Gabriel graph: no other neighbor lies in the sphere around both.  The lower or the higher of two
-    numbers owns it, as their sum is even or odd, so that all points own about as many.
+    Pairs are the edges of a Gabriel graph: the sphere over a pair holds no other neighbor.  One end owns the pair: that
+    of the lower or the higher index, depending on the parity of their sum, so that all points own about as many.
     """
     own = jnp.arange(len(neighbors), dtype=neighbors.dtype)
     other = neighbors[:, 1:]
@@ -149,7 +147,7 @@ def propose(
 
 
 def complete(way: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
-    """Unit vectors along the ways in the planes of unit normals; any in the plane where a way is at right angles."""
+    """Unit vectors: the directions projected to the planes of the normals; any vector of the plane if that is 0."""
     axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(3)[:1], jnp.eye(3)[1:2])
     flat = way - jnp.sum(way * normal, axis=1, keepdims=True) * normal
     other = axis - jnp.sum(axis * normal, axis=1, keepdims=True) * normal
@@ -157,11 +155,11 @@ def complete(way: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Arr
 
 
 def place(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Places:
-    """Where children of all points are looked for, CHILDREN of each point side by side."""
+    """Candidates of all points, CHILDREN consecutive ones for each point."""
     ends, exists, ways = jax.lax.stop_gradient(propose(nodes, neighbors))
     own = jnp.broadcast_to(jnp.arange(len(ends), dtype=ends.dtype)[:, None], ends.shape)
     first, second, exists, ways = own.reshape(-1), ends.reshape(-1), exists.reshape(-1), ways.reshape(-1, 3)
-    turned = nodes.spacing[first] > nodes.spacing[second]  # not by number: points may come in any order
+    turned = nodes.spacing[first] > nodes.spacing[second]  # not by index: points may come in any order
     turned = turned | ((nodes.spacing[first] == nodes.spacing[second]) & (first > second))
     first, second = jnp.where(turned, second, first), jnp.where(turned, first, second)
     alone = (first == second)[:, None]
@@ -179,7 +177,7 @@ def place(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Places:
 
 
 def find_around(nodes: Nodes, neighbors: Array, first: Array, second: Array, middle: Array) -> Int[Array, "m 16"]:
-    """Numbers of the points nearest to each place, among the neighbors of both ends; -1 for none."""
+    """Indices of the points nearest to each candidate, among the neighbors of both ends; -1 for none."""
     one, two = neighbors[first], neighbors[second]
     again = jnp.any(one[:, None] == two[:, :, None], axis=2)
     number = jnp.concatenate([one, jnp.where(again, -1, two)], axis=1)
@@ -198,26 +196,26 @@ class Convolution(nn.Module):
         self.norm = nn.LayerNorm()
 
     def __call__(self, hidden: Array, sent: Array, edges: Array, real: Array) -> Float[Array, "n 64"]:
-        """New features of points, from what their neighbors send along these edges."""
+        """New features of the points, from the messages of their neighbors along these edges."""
         message = nn.relu(self.own(hidden)[:, None] + sent + self.edge(edges))
         message = pool(nn.relu(self.message(message)), real)
         return self.norm(hidden + self.out(nn.relu(self.into(jnp.concatenate([hidden, message], axis=1)))))
 
     def send(self, hidden: Float[Array, "n 64"]) -> Float[Array, "n 64"]:
-        """What each point tells its neighbors."""
+        """The messages of the points to their neighbors."""
         return self.other(hidden)
 
     def first(self, hidden: Array, edges: Array, real: Array) -> Array:
-        """One round among points that neighbor none but themselves: for the shapes of the weights."""
+        """One convolution of points that are their own only neighbors: to initialise the weights."""
         return self(hidden, self.send(hidden)[:, None], edges, real)
 
 
 class Proposal(nn.Module):
-    """Children of places: a PointNet in each place's frame over the points around it."""
+    """Predicts children: a PointNet over the points around each candidate, in the candidate's frame."""
 
     @nn.compact
     def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], places: Places) -> Children:
-        """Residuals on the middles of the places; untrained, the middles themselves."""
+        """Residuals on the middles of the candidates; without training, the middles themselves."""
         real = places.around >= 0
         seen, offset = look(nodes, places)
         told = compare_ends(nodes, places)
@@ -255,7 +253,7 @@ def init(key: Key, nodes: Nodes, places: Places) -> dict:
 
 
 def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
-    """The children of places: graph convolutions over the points, then a PointNet around each place, block by block."""
+    """The children of the candidates: graph convolutions, then a PointNet for each candidate, in blocks."""
     hidden: Any = nn.Dense(FEATURES).apply({"params": params["point"]}, nodes.traits)
     around = neighbors[:, 1:]
     edges = relate(nodes, around)
@@ -270,7 +268,7 @@ def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: P
 
 
 def convolve(params: dict, hidden: Array, edges: Array, around: Array, exists: Array) -> Any:
-    """Features of the points after a round, block by block."""
+    """Features of the points after one graph convolution, in blocks."""
     sent: Any = Convolution().apply({"params": params}, hidden, method="send")
 
     def one(hidden: Array, edges: Array, around: Array) -> Any:
@@ -280,19 +278,19 @@ def convolve(params: dict, hidden: Array, edges: Array, around: Array, exists: A
 
 
 def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2*f"]:
-    """Largest (of numbers above 0) and mean of what is real."""
+    """Maximum (of values above 0) and mean over the entries that are real."""
     values = values * real[..., None]
     mean = jnp.sum(values, axis=1) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True), 1)
     return jnp.concatenate([jnp.max(values, axis=1), mean], axis=1)
 
 
 def turn(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Array, "m 3"]:
-    """Vectors in frames, in the axes of the cloud."""
+    """Vectors given in local frames, in the axes of the cloud."""
     return jnp.einsum("mj,mji->mi", vectors, frame, precision="highest")
 
 
 def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
-    """Numbers of each point and neighbor that do not change when the cloud is turned."""
+    """Rotation-invariant features of each edge from a point to a neighbor."""
     spacing = nodes.spacing[:, None]
     offset = (nodes.position[around] - nodes.position[:, None]) / spacing[..., None]
     normal, other = nodes.normal[:, None], nodes.normal[around]
@@ -306,7 +304,7 @@ def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
 
 
 def look(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
-    """What is seen of the points around each place, and the way to them in its frame and scale."""
+    """Features of the points around each candidate, and their offsets in its frame and scale."""
     number, scale = places.around, places.scale[:, None]
     way = (nodes.position[number] - places.middle[:, None]) / scale[..., None]
     offset = clamp(jnp.einsum("mki,mji->mkj", way, places.frame), -8, 8)
@@ -322,7 +320,7 @@ def look(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Ar
 
 
 def compare_ends(nodes: Nodes, places: Places) -> Float[Array, "m 7"]:
-    """Numbers of both ends of each place."""
+    """Features that compare the two ends of each candidate."""
     one, two = places.first, places.second
     way = (nodes.position[two] - nodes.position[one]) / places.scale[:, None]
     heights = [jnp.sum(way * nodes.normal[x], axis=1) for x in (one, two)]
@@ -334,15 +332,15 @@ def compare_ends(nodes: Nodes, places: Places) -> Float[Array, "m 7"]:
 
 
 def blend(shares: Float[Array, "m k"], values: Float[Array, "m k ..."]) -> Float[Array, "m ..."]:
-    """Sums of the values times their shares."""
+    """Weighted sums of the values."""
     return jnp.einsum("mk,mk...->m...", shares, values, precision="highest")
 
 
 def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children: Children) -> Bool[Array, " m"]:
-    """Which children are kept: likely ones, no two of them too near to each other or to a measured point.
+    """Which children are kept: likely ones that are not too close to each other or to a measured point.
 
-    The better of two is the one that is likelier and farther from measured points; in each round all go on that are
-    better than their rivals (a maximal independent set, Luby 1986), so the order of points does not matter.
+    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the children
+    that beat all their rivals (maximal independent set, Luby 1986), so the order of points does not matter.
     """
     count = len(neighbors)
     near = neighbors[:, :12]
@@ -352,7 +350,7 @@ def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children
     closest = CLOSEST * scale.reshape(count, CHILDREN, 1)
 
     def compare(others: Array, facing: Array) -> Array:
-        """Squared distances over those at which children begin to be too near; those that face away are farther."""
+        """Squared distances over CLOSEST squared, plus a term for different normals; below 1 is too close."""
         far = jnp.sum((others[:, None] - position[:, :, None]) ** 2, axis=-1)
         unlike = 1 - jnp.einsum("nki,nci->nck", facing, normal, precision="highest")
         return far / closest**2 + AWAY * unlike
@@ -379,11 +377,11 @@ def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children
 
 
 def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
-    """The cloud (unbatched, any units), then CHILDREN more points for each, of which `mask` says which are kept.
+    """The cloud (unbatched, any units), then CHILDREN slots for each of its points; `mask` is True for the kept ones.
 
-    Pure, of fixed size: jit, vmap over equally padded clouds, grad.  `params` are those of the model, `neighbors` are
-    `spnr_jax.neighbors(cloud)`; `encode` needs those of the result.  All points have normals, measured ones those that
-    are given or estimated; `invented` tells which are measured.  UserError for params without a densifier.
+    Pure, of static size: jit, vmap over equally padded clouds, grad.  `params` are the model's, `neighbors` those of
+    `spnr_jax.neighbors(cloud)`; find them anew for the result before `encode`.  All points of the result have normals:
+    given, estimated or predicted.  `invented` is 0 for measured points.  UserError for params without a densifier.
     """
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")

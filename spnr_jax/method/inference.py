@@ -33,7 +33,7 @@ def init(key: Key, config: NetworkConfig) -> dict:
 
 
 def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:
-    """The smallest valid inputs of the generator, for the shapes of its parameters."""
+    """The smallest valid inputs of the generator, to initialise its parameters."""
     points, size = jnp.zeros((1, 2, 3)), config.image_resolution
     scalars = jnp.zeros((1, 2))
     cloud = PointCloud(
@@ -44,14 +44,14 @@ def example_inputs(config: NetworkConfig) -> tuple[PointCloud, Camera]:
 
 
 def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
-    """Scenes of the clouds, objects first on every array."""
+    """Encoded scenes of a batch of clouds; all arrays have a leading axis of objects."""
     return network(config).bind(variables).encode(cloud)
 
 
 def render(
     variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, options: RenderOptions | None = None
 ) -> Rendering:
-    """Views of encoded scenes, samples at the middles of their strata."""
+    """Views of encoded scenes; without jitter, each sample lies in the middle of its stratum."""
     options = options or RenderOptions(block=config.ray_block)
     return network(config).bind(variables).render(scene, camera, options)
 
@@ -66,7 +66,7 @@ jitted_render = jax.jit(render, static_argnames=("config", "options"))
 def loss(
     variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
-    """(loss, outcome): errors of the pixels that a step renders, and the losses of the network's own."""
+    """(loss, outcome): errors of the rendered pixels, plus the losses that the network sows."""
     if key is not None and config.pixel_stride > 1:
         key, lattice_key = jax.random.split(key)
         batch = lattice(lattice_key, batch, config.pixel_stride)
@@ -85,7 +85,7 @@ def loss(
 
 
 def lattice(key: Key, batch: Batch, stride: int) -> Batch:
-    """The batch with every `stride`-th row and column of its views, from a random first one on: images still."""
+    """The batch with every `stride`-th row and column of its views, from a random offset: still an image."""
     first = jax.random.randint(key, (2,), 0, stride)
 
     def thinned(x):
@@ -94,7 +94,7 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
             x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
         return x
 
-    # pixel i of the lattice has its centre at first + stride * i + 0.5 of the view
+    # the centre of the lattice's pixel i is at first + stride * i + 0.5 of the view
     shift = 0.5 - (first[::-1] + 0.5) / stride
     zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
     intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
@@ -106,7 +106,7 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
 
 
 def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
-    """Mean error of all pixels, or of those that are `seen` (0 if there are none)."""
+    """Mean error over all pixels, or over those where `seen` is True (0 if there are none)."""
     if seen is None:
         return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
     error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
@@ -120,7 +120,7 @@ def reconstruction_loss(
     reference: Array,
     seen: Array | None = None,
 ) -> Float[Array, ""]:
-    """Weighted errors of the image, and of a smaller volume rendering against the reference averaged to its size."""
+    """Weighted errors of the image, and of the low-resolution rendering against the downsampled reference."""
     error = pixel_error(config, image, reference, seen)
     if config.model.upsamples:
         low = losses.area_downsample(reference, image_lr.shape[-2])
@@ -135,7 +135,7 @@ def reconstruction_loss(
 def encode_volume(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: NetworkConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched), one compilation per bucket of points."""
+    """Volume of a cloud in the box (unbatched); compiled once per padded size."""
     cloud = dataclasses.replace(cloud, normals=None, materials_known=None)
     cloud = cloud_arrays.pad(cloud, cloud_arrays.bucket(len(np.asarray(cloud.positions))))
     scene = _encode(variables, cloud, config=config)
@@ -152,8 +152,8 @@ def draw_each(
     quality: str = "trained",
     options: RenderOptions | None = None,
 ) -> Iterator[Rendering]:
-    """Views one after the other; UserError for a light, and for odd sizes of a network that doubles its pictures."""
-    del quality  # these networks have one; others say in the options what theirs is
+    """Views one after the other.  UserError for a light, or for odd sizes if the network doubles the resolution."""
+    del quality  # these networks have one quality; others choose theirs through `options`
     for view, light in zip(views, lights, strict=True):
         if light is not None:
             raise UserError("this network knows the light of its training alone; give no light")
@@ -162,13 +162,13 @@ def draw_each(
         yield _render(variables, volume.scene, volume.centre, volume.scale, view, config=config, options=options)
 
 
-# These are compiled whole: each operation outside of a jit would be compiled alone, 30 ms apiece at the first call.
+# Compiled as a whole: outside of jit, each operation would be compiled alone, 30 ms each at the first call.
 
 
-# this option halves the compilation of the U-Net and costs it no time; rendering would take twice as long
+# this option halves the compilation time of the U-Net and does not slow it down; rendering would take twice as long
 @partial(jax.jit, static_argnames="config", compiler_options=QUICK)
 def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
-    """What the network makes of a cloud in the box (unbatched)."""
+    """The encoding of a cloud in the box (unbatched)."""
     scene = encode(variables, jax.tree.map(lambda x: x[None], cloud), config=config)
     return jax.tree.map(lambda x: x[0], scene)
 
@@ -184,7 +184,7 @@ def _render(
     config: NetworkConfig,
     options: RenderOptions | None,
 ) -> Rendering:
-    """A view; depth in the cloud's units."""
+    """One view; depth in the cloud's units."""
     scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.in_box(camera, centre, scale)))
     rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config, options=options)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)

@@ -1,6 +1,6 @@
-"""The handle for pictures: load a network, encode a cloud once, render it from anywhere.
+"""The handle for pictures: load a network, encode a cloud once, render it from any camera.
 
-    model = spnr_jax.load()  # the network of the package; or a run folder, a file of weights
+    model = spnr_jax.load()  # pretrained; or a run folder, or a weights file
     volume = model.encode(spnr_jax.read_cloud("chair.ply"))
     rendering = model.render(volume, model.camera(volume, azimuth=30, elevation=20))
 
@@ -31,18 +31,18 @@ Angle = float | int | np.floating | jax.Array  # degrees
 class Model:
     """A trained network: the functions of its method (`methods.Method`) with its weights.
 
-    Its programs are compiled once for each bucket of points and size of pictures; `encode` and `render` themselves also
-    work on the host, so they are not for `jax.jit`: `spnr_jax.encode` and `spnr_jax.render`, and of Linen modules
-    `inference.encode` and `inference.render`, are.
+    Its programs are compiled once for each padded cloud size and picture size.  `encode` and `render` also work on the
+    host, so they cannot be traced by `jax.jit`.  The functions that can are `spnr_jax.encode` and `spnr_jax.render`;
+    for Linen modules, `inference.encode` and `inference.render`.
     """
 
     config: NetworkConfig
     variables: dict
 
     def encode(self, cloud: PointCloud, densify: bool = True) -> Volume:
-        """Volume of a cloud (unbatched, any units, y up).  ValueError if it holds no points, NaN or infinity.
+        """Volume of a cloud (unbatched, any units, y up).  ValueError if it is empty or contains NaN or infinity.
 
-        Without `densify` a sparse cloud gets no learned points: faster, and less sharp where it ends or bends.
+        Without `densify`, a sparse cloud gets no learned points: faster, but less sharp at rims and on curved parts.
         """
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
@@ -63,13 +63,13 @@ class Model:
     def render(
         self, volume: Volume, camera: Camera, quality: Quality = "best", light: Light | None = None
     ) -> Rendering:
-        """The object as the camera (unbatched, or with one axis of views) sees it; depth in the cloud's units.
+        """The object as seen by the camera (unbatched, or with one axis of views); depth in the cloud's units.
 
-        The network over surfels takes a light (default: the package's room), leaves its CNN out of `draft`, and draws
-        fewer pixels at `balanced`, which are enlarged.  Other networks know the light that they were trained in alone.
+        The surfel network takes a light (default: the room).  It skips its CNN at `draft`, and draws fewer pixels and
+        enlarges the picture at `balanced`.  Other networks know only the light that they were trained with.
 
-        The paper's network looks near the points alone at `draft`, `balanced` and `best`, with a quarter, half and all
-        of the samples of a ray, and renders as it was trained at `trained`.
+        The paper's network samples only near the points at `draft`, `balanced` and `best`, with a quarter, half and all
+        of its samples per ray.  At `trained` it samples the whole box, as in training.
         """
         if camera.cam_to_world.ndim == 2:
             return next(self.render_each(volume, [camera], quality, [light]))
@@ -85,7 +85,7 @@ class Model:
     ) -> Iterator[Rendering]:
         """The object from several cameras, one after the other, each in its light: for films, whose frames are alike.
 
-        The network over surfels gives its pictures common sizes, so that it is compiled once and not for most of them.
+        The surfel network uses common array sizes for all frames, so that it is compiled once.
         """
         _check_quality(quality)
         lights = lights or [None] * len(views)
@@ -99,16 +99,16 @@ class Model:
         elevation: Angle = 20.0,
         resolution: int | None = None,
     ) -> Camera:
-        """Camera that sees the whole object: degrees around the y axis from +z, and above the horizon.
+        """Camera that frames the whole object; azimuth around the y axis from +z and elevation, in degrees.
 
-        Pure: angles and object may be traced.
+        Pure: angles and volume may be traced.
         """
         size = resolution or self.config.image_resolution
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
 
     @property
     def params(self) -> dict:
-        """The weights, a pytree of arrays: what `spnr_jax.encode` and `spnr_jax.render` take."""
+        """The weights, a pytree of arrays: the first argument of `spnr_jax.encode` and `spnr_jax.render`."""
         return self.variables
 
 
@@ -119,9 +119,9 @@ def render_views(
     camera: Camera,
     light: Light | Sequence[Light] | None = None,
 ) -> Rendering:
-    """All views of one object in the box (clouds of data sets are), as the network was trained.
+    """All views of one object that is already in the box (as clouds of data sets are), at the quality of training.
 
-    The light, or one for each view, is for a network that sees it; None is the package's room.
+    `light`, one or one for each view, is for networks that take a light; None is the room.
     """
     method, views = method_of(config), unstack(camera)
     volume = method.encode(variables, cloud, np.zeros(3, np.float32), np.float32(1), config=config)

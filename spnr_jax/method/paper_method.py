@@ -1,13 +1,13 @@
 """The paper's method on one page: points -> volume -> features along rays -> image.
 
-    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)             once per object
+    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)        once per object
     render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
     trace    all rays: empty ones are skipped, the others rendered in blocks on the device of their object
     march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
 
-Its loss is that of every Linen module (`inference.loss`), with a discriminator.  Objects lead, views follow: clouds are
-(objects, points, ...), cameras (objects, views, ...).  Rays march through a *field*: a function from distances (*rays,
-samples) to `Samples`.
+It uses the loss of Linen modules (`inference.loss`) and a discriminator.  The first axis is objects, the second views:
+clouds are (objects, points, ...), cameras (objects, views, ...).  A *field* is a function from distances along rays
+(*rays, samples) to `Samples`.
 """
 
 import dataclasses
@@ -33,23 +33,23 @@ from spnr_jax.kernels.voxels import Path
 from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsampler
 
-SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples a ray was trained with
-REACH_PER_SPACING = 1.6  # what loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
-CELLS_PER_VOXEL = 1  # of a path through the box, counted along an axis
+SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples per ray in training
+REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
+CELLS_PER_VOXEL = 1  # along an axis: cells of the path of a ray through the box
 RAY_BLOCK = 256  # rays near points that are rendered at once
-CPU_BLOCK = 64  # the same on a CPU without a training's key: what they read stays in its first cache
-LOOKED_AT = 2**14  # rays of which it is found out at once whether they meet anything
+CPU_BLOCK = 64  # the same on a CPU outside of training: what a block reads stays in the first-level cache
+LOOKED_AT = 2**14  # rays that are tested at once for whether they hit anything
 
 
 class Samples(NamedTuple):
-    """A field at samples: density, and a tree of numbers (*rays, samples, ...) that are composited."""
+    """The field at samples: density, and a pytree (*rays, samples, ...) of values to composite."""
 
     density: Array
     summed: Any
 
 
 class Seen(NamedTuple):
-    """Rays after compositing: `summed` of the samples, opacity, and the expected distance."""
+    """Rays after compositing: the composited values `summed`, opacity, and expected distance."""
 
     summed: Any
     acc: Array
@@ -57,7 +57,7 @@ class Seen(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """Rays of objects: features, of which the first three are RGB on white, expected distance, opacity."""
+    """Rays of objects: features (the first three are RGB on white), expected distance, opacity."""
 
     features: Float[Array, "*rays k"]
     depth: Float[Array, "*rays"]
@@ -69,7 +69,7 @@ Finish = Callable[[Seen], Float[Array, "*rays k"]]
 
 
 class PaperNetwork(nn.Module):
-    """The generator: a volume from a cloud, pictures from a volume."""
+    """The generator: encodes clouds to volumes, and renders volumes."""
 
     config: PaperConfig
 
@@ -104,7 +104,7 @@ class PaperNetwork(nn.Module):
         return round(camera.height * ratio), round(camera.width * ratio)
 
     def along(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Finish]:
-        """Density, and what is emitted, at samples along rays; and the features of what is composited of it."""
+        """The field along rays (density, emitted values), and the function from composited values to features."""
         view = self.field.view(rays.directions)
 
         def field(distances: Float[Array, "*rays samples"]) -> Samples:
@@ -141,10 +141,10 @@ class PaperNetwork(nn.Module):
 def trace(
     module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, options: RenderOptions, key: Key | None
 ) -> Traced:
-    """The rays (objects, rays, ...) of a network; a key jitters the samples of each ray by the ray's number.
+    """Renders rays (objects, rays, ...).  A key jitters the samples; each ray folds in its own number.
 
-    The network is a bound Linen module: `along(scene, rays, objects)` is its field along rays, and the function that
-    makes features of what is `Seen`; `config.num_features` are the features of a ray.
+    The network is a bound Linen module.  `along(scene, rays, objects)` gives its field and the function from `Seen` to
+    features; `config.num_features` is the number of features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
@@ -168,7 +168,7 @@ def _on_one_device(
     options: RenderOptions,
     key: Key | None,
 ) -> Traced:
-    """`trace` of the device's own rays."""
+    """`trace` of the rays that lie on one device."""
     shape = number.shape
     objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
     inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays))
@@ -183,7 +183,7 @@ def _on_one_device(
     size = options.block
     if size is None and samples.reach:
         size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
-    if size is None or bound().is_initializing():  # a module that is made has no weights yet for a block to read
+    if size is None or bound().is_initializing():  # at initialisation there are no weights yet that a block could read
         traced = block(*inputs)
     else:
         objects, _, rays = inputs
@@ -195,7 +195,7 @@ def _on_one_device(
 
 
 def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> Path:
-    """The part of each ray that is sampled: what lies near points, or all that lies in the box."""
+    """The sampled part of each ray: its segments near points, or all of it inside the box."""
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
         return voxels.whole_path(near, far)
@@ -205,17 +205,17 @@ def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects:
 def _meets(
     near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]
 ) -> Bool[Array, " rays"]:
-    """Whether there is anything to sample on each ray; paths are many numbers, so they are not kept."""
+    """Whether a ray has anything to sample; paths are large, so they are not stored."""
     return jax.lax.map(lambda x: _path(near_points, *x).travelled[-1] > 0, (rays, objects), batch_size=LOOKED_AT)
 
 
 def places(rays: Rays, distances: Float[Array, "*rays samples"]) -> Float[Array, "*rays samples 3"]:
-    """Positions of samples: rays end on the faces of the box, and rounding must not push them out of it."""
+    """Positions of samples, clamped to the box: rays end on its faces, and rounding must not push samples out."""
     return clamp(rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :], -1, 1)
 
 
 def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> Seen:
-    """What is seen of a field along paths; the key is one for all rays, or one for each."""
+    """Renders a field along paths; `key` is one key for all rays, or one per ray."""
     coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
     length, far = path.travelled[..., -1], path.edges[..., -1]
     coarse, edges = sampling.stratified(coarse_key, jnp.zeros_like(length), length, counts.num_coarse)
@@ -223,7 +223,7 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
     weights, _ = compositing.volume_weights(passes[0].density, compositing.interval_lengths(coarse, length))
     travelled, shares = coarse, [weights]
     if counts.num_fine:
-        # 64 fine samples where the coarse weights are large [paper]; the union of both is composited
+        # 64 fine samples where the coarse weights are large [paper]; both sets are composited together
         fine = sampling.importance(fine_key, edges, weights, counts.num_fine, counts.padding)
         passes.append(field(voxels.distance_at(path, fine)))
         density = jnp.concatenate([samples.density for samples in passes], axis=-1)
@@ -231,7 +231,7 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
         travelled = jnp.concatenate([coarse, fine], axis=-1)
         shares = jnp.split(weights, [counts.num_coarse], axis=-1)
 
-    # each pass is composited where it lies: sums do not mind the order, and nothing wide is concatenated
+    # coarse and fine samples are summed separately: the order does not matter, and no large arrays are concatenated
     sums = [
         jax.tree.map(partial(compositing.composite, share), samples.summed)
         for share, samples in zip(shares, passes, strict=True)
@@ -251,7 +251,7 @@ def union_weights(
 ) -> Float[Array, "*batch n+m"]:
     """Compositing weights of coarse and fine samples together, in the order [coarse, fine].
 
-    Only densities are sorted along the ray; what the weights multiply can stay where it is.
+    Only the densities are sorted along the ray; the values that the weights multiply need not be.
     """
     order, rank = sampling.merge(coarse, fine)
     distances = jnp.concatenate([coarse, fine], axis=-1)
@@ -266,7 +266,7 @@ def union_weights(
 def encode(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched), and how far from its points there is something to see."""
+    """Volume of a cloud in the box (unbatched), and how far from its points rays are sampled."""
     reach = reach_of(np.asarray(cloud.positions)[np.asarray(cloud.mask)], config.encoder.volume_resolution)
     volume = inference.encode_volume(variables, cloud, centre, scale, config=config)
     return dataclasses.replace(volume, reach=reach)
@@ -281,13 +281,13 @@ def render(
     config: PaperConfig,
     quality: str,
 ) -> Iterator[Rendering]:
-    """Views one after the other, with the samples of a quality."""
+    """Views one after the other, with the number of samples of a quality level."""
     options = at_quality(config, quality, volume.reach)
     return inference.draw_each(variables, volume, views, lights, config=config, options=options)
 
 
 def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:
-    """The options that render a picture at a quality, with samples within `reach` voxels of points."""
+    """The rendering options of a quality level, with samples only within `reach` voxels of points."""
     if quality == "trained":
         return None
     counts = config.sampling
@@ -296,15 +296,15 @@ def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions |
 
 
 def discriminator(config: TrainConfig) -> Discriminator:
-    """The judge of pictures and condition images."""
+    """The PatchGAN discriminator of images and condition images."""
     assert isinstance(config.model, PaperConfig)
     return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 
 def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
-    """Voxels around points in which their surface lies, from the median distance to the nearest other point.
+    """Distance from points, in voxels, within which the surface lies; from the median distance to the nearest neighbor.
 
-    Copies of a point, closer than a 1024th of the box, count once.
+    Duplicates of a point (closer than 1/1024 of the box) count once.
     """
     x, y, z = np.floor((positions.T + 1) * 512).astype(np.int64)
     _, distinct = np.unique((x * 2048 + y) * 2048 + z, return_index=True)

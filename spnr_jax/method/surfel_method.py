@@ -1,7 +1,7 @@
-"""Our method for the handle, scores and the viewer: `surfel_renderer`, compiled.
+"""The surfel method for `Model`, evaluation and the viewer: `surfel_renderer`, compiled.
 
-Several views share their sizes.  Two programs draw them at a quality and in a light: the first is compiled anew for
-other numbers of entries and pixels; the second, which XLA compiles slowly, only for other windows.
+Several views share array sizes.  A picture is drawn by two programs: the first is compiled anew for each number of
+entries and pixels; the second, which XLA compiles slowly, only for each window size.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
 from spnr_jax.surfels.layers import RULES
 from spnr_jax.surfels.lighting import room_light
 
-BALANCED = 0.75  # of the pixels along a side, which are drawn and enlarged: docs/lab/performance.md
+BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
 
 
 class Asked(NamedTuple):
-    """A view in its light, and what it needs: the camera that is drawn, doublings and side, sizes."""
+    """A view with its light, and its requirements: the camera that is drawn, doublings and side, sizes."""
 
     camera: Camera
     light: Light
@@ -49,7 +49,7 @@ def init(key: Key, config: SurfelConfig) -> dict:
 def encode(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
-    """Volume of a cloud in the box (unbatched); sparse ones get learned points between their own."""
+    """Volume of a cloud in the box (unbatched); sparse clouds get learned points."""
     cloud = densify_sparse(variables, cloud)
     scene = encode_in_box(cloud)
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
@@ -57,9 +57,9 @@ def encode(
 
 
 def encode_in_box(cloud: PointCloud) -> SurfelScene:
-    """Scene of a cloud in the box (unbatched), of centre 0 and scale 1; on the host, compiled once for a bucket.
+    """Scene of a cloud in the box (unbatched), with centre 0 and scale 1; on the host, compiled once per padded size.
 
-    Its surfels are those of the real points in an order in which close ones follow each other, padded.
+    The surfels are those of the unmasked points, sorted so that close points are close in memory, and padded.
     """
     real = cloud_arrays.strip(cloud)
     real = jax.tree.map(np.float32, real).replace(mask=real.mask)
@@ -70,7 +70,7 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
 
 
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
-    """A sparse cloud in the box (unbatched) with learned points between its own, if there is a network for them."""
+    """A sparse cloud in the box (unbatched) with learned points added, if the variables include a densifier."""
     count = int(np.sum(cloud.mask))
     if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.invented is not None:
         return cloud
@@ -87,7 +87,7 @@ def render(
     config: SurfelConfig,
     quality: str,
 ) -> Iterator[Rendering]:
-    """Views one after the other; they share the sizes of the largest of them, so that few programs are compiled."""
+    """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
     shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     asked = [look_at(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
     common = {
@@ -105,7 +105,7 @@ def render(
 
 
 def look_at(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
-    """What is drawn of a view with a share of its pixels along a side, and what that needs."""
+    """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
     if share != 1:
         camera = cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
     doublings, side = surfel_renderer.resolution(scene, camera, share)
@@ -114,7 +114,7 @@ def look_at(scene: SurfelScene, camera: Camera, light: Light | None, share: floa
 
 
 def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Sizes) -> Rendering:
-    """A view with room for these sizes."""
+    """A view drawn with arrays of these sizes."""
     if not asked.needed.entries:
         return _leave_empty(volume.scene, asked.camera)
     plan = surfel_renderer.round_sizes(sizes, *asked.resolution)
@@ -135,7 +135,7 @@ _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 @jax.jit
 def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
-    """A view in which nothing of the object is seen."""
+    """An empty view: the object is not visible."""
     inside = cameras.in_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
     image, depth, acc = surfel_renderer.paste(*nothing, inside, 1)

@@ -1,13 +1,13 @@
-"""Our method on one page: points -> surfels -> G-buffer -> shader network -> light on materials -> picture.
+"""Our method on one page: points -> surfels -> G-buffer -> shader network -> materials in light -> picture.
 
     encode   neighbors, layers, sides, visibility by direction (surfels/)     once per object; pure
-    plan     the sizes of a picture, counted on the host: sizes shape arrays  once per view, or for many views
+    plan     static array sizes of a picture, counted on the host             once per view, or for many views
     render   discs splatted to a G-buffer, a CNN over it, light               once per view; pure
 
-A picture is drawn at the resolution at which the points lie FINEST to COARSEST pixels apart and doubled from there by
-the network, so its work follows the points and the pixels that they cover.  Only a window around the object is drawn.
-Its position is traced, its size belongs to the plan.  Sizes are rounded up to a few values: each new one is compiled
-once.
+The G-buffer has the resolution at which points lie FINEST to COARSEST pixels apart; the network doubles it from there.
+So the work depends on the number of points and of covered pixels.  Only a window around the object is drawn: its
+position is traced, its size is part of the plan.  Sizes are rounded up to a few values, because each new size is
+compiled once.
 """
 
 import dataclasses
@@ -40,21 +40,20 @@ from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
 from spnr_jax.surfels import lighting, splatting
 from spnr_jax.surfels.splatting import MOST_ENTRIES
 
-COARSEST = 3.5  # pixels between points from which on a picture is drawn at half the size
-FINEST = 0.8  # below which it is drawn at twice the size and averaged
-SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side of pictures where that costs little, and their limit
+COARSEST = 3.5  # pixels between points above which the G-buffer has half the picture's resolution
+FINEST = 0.8  # pixels between points below which it has twice the resolution and is averaged
+SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture is small, and its FINEST
 MOST_DOUBLINGS = 4
-STEP, MARGIN = 32, 8  # pixels of which a window is a multiple, and around the object in it
-GRID = 8  # of which a window's corner is a multiple: the network's levels see the same squares from every camera
-LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a picture is planned for
+STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
+GRID = 8  # a window's corner is a multiple: the network's pooling grid is the same from every camera
+LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 
 
 class Plan(NamedTuple):
     """Static sizes of a picture: hashable, made by `plan` or by hand.
 
-    `doublings` by the network, and `side` pixels averaged along each side of a pixel (1 or 2); `width` and `height` of
-    the window of the G-buffer, in its pixels; `entries` pairs of disc and pixel and `slots` covered pixels that there
-    is room for.
+    `doublings` by the network; `side`: each pixel averages side x side drawn ones (1 or 2); `width` and `height` of the
+    window, in pixels of the G-buffer; capacities: `entries` (pairs of disc and pixel) and `slots` (covered pixels).
     """
 
     doublings: int
@@ -66,7 +65,7 @@ class Plan(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """What a picture needs: columns and rows of the window, entries, covered pixels at most; arrays or ints."""
+    """Sizes that a picture needs: window width and height, entries, upper bound of covered pixels; arrays or ints."""
 
     width: Any
     height: Any
@@ -78,10 +77,10 @@ class Sizes(NamedTuple):
 
 
 def plan(scene: SurfelScene, camera: Camera) -> Plan:
-    """Sizes that hold every view, of a camera or of a batch of them (leading axes), of one scene or of a stack.
+    """Sizes that suffice for every view of a camera or a batch of cameras, and one scene or a stack of scenes.
 
-    On the host: what shapes arrays cannot be traced.  The axes of a stack of scenes lead those of the cameras, or the
-    cameras have none.  ValueError for a picture that needs more entries than can be sorted.
+    Runs on the host, because array sizes cannot be traced.  The axes of a stack of scenes lead those of the cameras, or
+    the cameras have none.  ValueError if a picture needs more entries than can be sorted.
     """
     batch = np.shape(camera.cam_to_world)[:-2]
     objects = np.shape(scene.spacing)
@@ -100,9 +99,9 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
 
 
 def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:
-    """Doublings by the network, and pixels averaged along each side, for the scene's spacing around its middle.
+    """Doublings by the network, and `side`, from the scene's spacing in pixels at its centre.
 
-    They are those of the picture of which the camera has a share of the pixels along a side.
+    `share` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
     """
     eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
@@ -114,7 +113,7 @@ def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[
 
 @partial(Kept, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
-    """What a view needs; the covered pixels are at most those of the rectangles around its discs."""
+    """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
     whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
     window = crop_camera(whole, corner, width, height)
@@ -123,17 +122,17 @@ def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int
 
 
 def _most(camera: Camera) -> tuple[int, int]:
-    """Rows and columns of a window at most: it begins in the picture, and may reach beyond it."""
+    """Largest rows and columns of a window: it begins inside the picture and may extend beyond it."""
     return camera.height + MARGIN + STEP, camera.width + MARGIN + STEP
 
 
 def largest(needed: Iterable[Sizes]) -> Sizes:
-    """Sizes that hold each of several."""
+    """Sizes that suffice for each of several."""
     return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
 
 
 def round_sizes(sizes: Sizes, doublings: int, side: int) -> Plan:
-    """The plan that holds these sizes; powers of the root of two, so that few are compiled."""
+    """The plan that holds these sizes; counts are rounded up to powers of the root of two, so that few are compiled."""
     entries, slots = (
         _round_count(*x)
         for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
@@ -148,14 +147,14 @@ def _round_count(count: int, least: int, most: int) -> int:
 
 
 def scale_camera(camera: Camera, doublings: int, side: int) -> Camera:
-    """The camera at the network's resolution; doubled, its picture may be larger than asked for, and is cut."""
+    """The camera at the G-buffer's resolution; the doubled picture may exceed the image, and is then cropped."""
     height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
     scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
     return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale, height=height, width=width)
 
 
 def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
-    """Corner (column, row), width and height of the window around what is drawn of the surfels."""
+    """Corner (column, row), width and height of the window around the visible surfels."""
     foot = splatting.footprints(surfels, camera)
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
@@ -168,7 +167,7 @@ def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int
 
 
 def round_up(pixels: Any) -> Any:
-    """The least multiple of STEP that holds so many pixels."""
+    """The least multiple of STEP that is not below `pixels`."""
     return -(-pixels // STEP) * STEP
 
 
@@ -184,14 +183,14 @@ def crop_camera(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any
 def render(
     params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None = None, *, plan: Plan
 ) -> Rendering:
-    """The object as a camera sees it, a pure function; depth in the cloud's units; light None is the package's room.
+    """The object as seen by a camera; pure; depth in the cloud's units; light None is the room.
 
-    One object, one view, one light: batches are `jax.vmap` of it, the plan is static.  Without params discs and light
-    alone.  `overflow` counts what did not fit into the plan.
+    One object, one view, one light: use `jax.vmap` for batches, with a static plan.  params=None draws discs and light
+    without the CNN.  `overflow` counts the entries and pixels that did not fit into the plan.
 
-    Gradients are those of the picture with its integers held: where the window lies, which pixels a disc covers, the
-    order of the discs in a pixel, and that no more than the first 24 count.  Where one of these changes, where a normal
-    turns its back, and at the kinks of clipped numbers the picture is only piecewise smooth.
+    Gradients hold all integers constant: position of the window, pixels that a disc covers, depth order in a pixel, and
+    the cut after 24 entries.  Where one of these changes, where a normal turns away from the camera, and at the kinks
+    of clipped values, the picture is only piecewise smooth.
     """
     _check(scene, camera, light, plan)
     light = lighting.room_light() if light is None else light
@@ -200,7 +199,7 @@ def render(
 
 
 def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
-    """ValueError in one line for what has other axes than one object, one view and one light."""
+    """ValueError in one line if there is not exactly one object, one view and one light."""
     for what, array, wanted in (
         ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
         ("camera.intrinsics", camera.intrinsics, (3, 3)),
@@ -215,7 +214,7 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
 
 
 class Blended(NamedTuple):
-    """The G-buffer of a picture's window, where that lies (column, row), and what did not fit into the plan."""
+    """The G-buffer of a picture's window, the window's corner (column, row), and the overflow."""
 
     buffer: GBuffer
     corner: Int[Array, "2"]
@@ -223,7 +222,7 @@ class Blended(NamedTuple):
 
 
 def blend_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> Blended:
-    """The first half of `render`: discs, and what of the light arrives at them."""
+    """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
     whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
     corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
     window = crop_camera(whole, corner, plan.width, plan.height)
@@ -252,7 +251,7 @@ def shade_window(
 def rasterize(
     surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
 ) -> tuple[GBuffer, Int[Array, ""]]:
-    """The G-buffer of a view, with what of the light arrives at each surfel; entries and pixels that did not fit."""
+    """The G-buffer of a view, with the light that surfels receive; and how many entries and pixels did not fit."""
     found, lost = splatting.entries(surfels, camera, room=room)
     surfels = shader.turn_to_camera(surfels, camera)
     buffer = splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)
@@ -264,7 +263,7 @@ def look(
 ) -> tuple[
     Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
-    """What the network sees of a G-buffer, the light maps, the light's harmonics in camera axes, the depth."""
+    """Inputs of the network, light maps, spherical harmonics of the light in camera axes, and depth."""
     told, maps = shader.features(buffer, light, camera)
     return told, maps, lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
@@ -278,7 +277,7 @@ def shade(
     *,
     doublings: int,
 ) -> Float[Array, "h w 5"]:
-    """Colour, opacity and depth along the camera's axis, of the window, doubled."""
+    """Colour, opacity and depth along the camera's axis in the window, at the doubled resolution."""
     if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
     else:
@@ -291,7 +290,7 @@ def shade(
 
 
 def shader_of(params: dict) -> Shader:
-    """The network that these weights belong to: its sizes are theirs."""
+    """The shader network for these weights; its sizes are read from them."""
     weights = params["params"]
     levels = sum(name.startswith("down") for name in weights)
     widths = tuple(weights[f"in{level}"]["kernel"].shape[-1] for level in range(levels))
@@ -301,7 +300,7 @@ def shader_of(params: dict) -> Shader:
 def paste(
     drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
-    """Image, depth along the rays and opacity of a picture that is empty but for a window, which may reach beyond."""
+    """Image, depth along rays and opacity of the whole picture: empty outside the window, which may extend beyond."""
     height, width = (n * side for n in (camera.height, camera.width))
     alpha = drawn[..., 3:4]
     layers = jnp.concatenate([drawn[..., :3] * alpha, alpha, drawn[..., 4:] * alpha], axis=-1)

@@ -1,8 +1,8 @@
-"""Extent and colors of discs: spacings, rims of layers, edges, gaps between random points, colors.
+"""Extent and colors of discs: spacing, rim of the layer, sharp edges, gaps between random points, borders of color.
 
-Pure functions of a block of points, which is the last axis.  `layer` (k, block) are the neighbors' weights as points of
-the same layer, `place` (k, 2, block) their places in the tangent plane.  Lengths are in spacings unless stated
-otherwise.
+Pure functions of a block of points, which is the last axis.  `layer` (k, block) weighs the neighbors by whether they
+lie on the same layer; `place` (k, 2, block) holds the neighbors' coordinates in the tangent plane.  Lengths are in
+spacings unless stated otherwise.
 """
 
 from typing import NamedTuple
@@ -27,17 +27,17 @@ from spnr_jax.kernels.numerics import (
 )
 from spnr_jax.surfels.layers import Hood, Rules, along
 
-RIM_DIRECTIONS = 16  # in which the end of a layer is looked for
-CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # of the sums beside a border, after those over the plane
+RIM_DIRECTIONS = 16  # in which the rim of a layer is searched
+CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # columns of a border's sums: moments of the colors
 TURN = 2 * np.pi / RIM_DIRECTIONS * np.arange(RIM_DIRECTIONS)
 
 
 def first_spacing(hood: Hood, rules: Rules) -> Float[Array, " block"]:
-    """From the area of the disc that holds some neighbors, whatever layer they are on; in units of the box."""
+    """Spacing from the area of the disc that holds a number of neighbors on any layer; in units of the box."""
     count = jnp.minimum(rules.first_disc, jnp.sum(hood.real, axis=0) - 1)
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
     distance = root(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
-    several = count > 0  # a single point stands for a tenth of the box
+    several = count > 0  # a single point represents a tenth of the box
     spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, rules.least_spacing)
     return jnp.where(several, spacing, rules.alone)
 
@@ -45,7 +45,7 @@ def first_spacing(hood: Hood, rules: Rules) -> Float[Array, " block"]:
 def own_spacing(
     hood: Hood, layer: Float[Array, "k block"], raw: Float[Array, " block"], rules: Rules
 ) -> Float[Array, " block"]:
-    """From the area of the disc that holds some neighbors of the layer; in units of the box."""
+    """Spacing from the area of the disc that holds a number of neighbors on the same layer; in units of the box."""
     others = len(layer) - 1
     held = jnp.matmul(jnp.tril(jnp.ones((others, others), layer.dtype)), layer[1:], precision="highest")
     wanted = jnp.minimum(rules.own_disc, jnp.maximum(rules.own_share * held[-1], 0.5))
@@ -61,7 +61,7 @@ def own_spacing(
 def smooth_spacing(
     layer: Float[Array, "k block"], spacings: Float[Array, "k block"], rules: Rules
 ) -> Float[Array, " block"]:
-    """Geometric mean over the nearest of the layer."""
+    """Geometric mean of the spacing over the nearest neighbors on the same layer."""
     weight, near = layer[: rules.smoothed], spacings[: rules.smoothed]
     return jnp.exp(total(weight * jnp.log(larger(near, rules.least_spacing))) / total(weight))
 
@@ -69,7 +69,7 @@ def smooth_spacing(
 def average(
     number: Int[Array, "k block"], weight: Float[Array, "k block"], seen: Float[Array, "all 64"]
 ) -> Float[Array, "block 64"]:
-    """Weighted means of the neighbors' rows."""
+    """Weighted means of the neighbors' rows of `seen`."""
 
     def add(sums: Array, neighbor: tuple[Array, Array]) -> tuple[Array, None]:
         rows = seen.at[jnp.maximum(neighbor[0], 0)].get(mode="clip")
@@ -82,13 +82,13 @@ def average(
 def measure_evenness(
     hood: Hood, layer: Float[Array, "k block"], spacing: Float[Array, " block"]
 ) -> Float[Array, " block"]:
-    """Spacings to the nearest other point of the layer: 0.5 in the median of random points, 0.7 to 0.8 of even ones."""
+    """Spacings to the nearest other point of the layer; median 0.5 for random points, 0.7 to 0.8 for even ones."""
     squared = jnp.min(jnp.where(layer[1:] > 0.5, hood.squared[1:], jnp.inf), axis=0)
     return jnp.sqrt(squared) / spacing
 
 
 def find_farthest(place: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
-    """How far the farthest of places in a plane lies in each of the directions."""
+    """Distance of the farthest point of the plane in each of 16 directions."""
     turn = jnp.asarray(TURN[: RIM_DIRECTIONS // 2], place.dtype)
     one, two = jax.lax.optimization_barrier((place[:, 0], place[:, 1]))
 
@@ -102,12 +102,12 @@ def find_farthest(place: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
 def bridge_gaps(
     place: Float[Array, "k 2 block"], layer: Float[Array, "k block"], rules: Rules
 ) -> Float[Array, " block"]:
-    """How many times wider a disc is beside gaps, so that the discs around a gap cover its middle.
+    """Factor by which a disc is enlarged beside gaps, so that the discs around a gap cover its middle.
 
-    A gap is an empty circle through the point with other points all around it (a vertex of the Voronoi diagram in the
-    tangent plane).  The empty circle whose center lies in a direction ends at the first point that it meets, and is
-    largest, among its neighbors in direction, at a vertex; where the layer ends it grows without limit.  With all
-    places inverted, p to 2 p / |p|^2, the farthest in a direction is as far away as that circle is curved.
+    A gap is an empty circle through the point with other points all around it; its center is a vertex of the Voronoi
+    diagram in the tangent plane.  For each direction, consider the largest empty circle through the point whose center
+    lies there.  Its radius has a local maximum at a Voronoi vertex, and no limit where the layer ends.  After the
+    inversion p -> 2 p / |p|^2, the distance of the farthest point in the direction is the curvature of that circle.
     """
     half = (place[:, 0] ** 2 + place[:, 1] ** 2) / 2
     other = (layer > 0.5) & (half > rules.same_place)
@@ -120,7 +120,7 @@ def bridge_gaps(
 
 
 class Cuts(NamedTuple):
-    """Where the planes of neighbors cut a disc, infinite where they do not, and the unit ways there in its plane."""
+    """Distances at which neighbors' planes cut a disc (infinite: no cut), and unit directions in the disc's plane."""
 
     distance: Float[Array, "k block"]
     across: Float[Array, "k block"]
@@ -136,7 +136,7 @@ def find_cuts(
     sides: Float[Array, "k block"],
     rules: Rules,
 ) -> Cuts:
-    """At a sharp edge the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
+    """At a sharp edge, the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
     across, up, facing = (along(normals, axis) for axis in axes)
     flat = root(across**2 + up**2)
     cuts = (facing < rules.sharp) & (flat > rules.steep) & (hood.real > 0)
@@ -150,10 +150,10 @@ def find_cuts(
 def find_rims(
     ends: Float[Array, "16 block"], cuts: Cuts, axes: Float[Array, "3 3 block"], rules: Rules
 ) -> tuple[Float[Array, "3 block"], Float[Array, "4 block"]]:
-    """The direction in which the layer ends soonest, and where it ends, as `Surfels` has them.
+    """The direction in which the layer ends first, and the distances of the ends, in the form of `Surfels`.
 
-    It ends a little beyond its last point, or where another face cuts it.  Which neighbor or direction ends it is a
-    constant.
+    A layer ends slightly beyond its last point, or where another face cuts it.  The choice of the neighbor or direction
+    that ends it is constant for gradients.
     """
     constant = jax.lax.stop_gradient((cuts.distance, ends))
     nearest, soonest = jnp.min(constant[0], axis=0), jnp.argmin(constant[1], axis=0)
@@ -187,10 +187,10 @@ def find_border(
     colors: Float[Array, "k 3 block"],
     rules: Rules,
 ) -> dict[str, Array]:
-    """The fields `border` (4, block) and `jump` (3, block) of a straight border of two colors, where there is one.
+    """The fields `border` (4, block) and `jump` (3, block): a straight border between two colors, where there is one.
 
-    Discs of one color would fray it at the spacing.  All of it fades in; which neighbors are of the other color is a
-    constant.
+    With one color per disc, a border would look frayed at the scale of the spacing.  Borders fade in smoothly.  Which
+    neighbors have the other color is constant for gradients.
     """
     squared = place[:, 0] ** 2 + place[:, 1] ** 2
     weight = layer * jnp.exp(-0.5 / rules.border_within**2 * squared)
@@ -211,12 +211,12 @@ def find_border(
 
 
 def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Array, " block"]:
-    """0 before the first end, 1 beyond the second."""
+    """Linear ramp: 0 before the first end, 1 beyond the second."""
     return clamp((values - ends[0]) / (ends[1] - ends[0]), 0, 1)
 
 
 def _part(weight: Float[Array, "k block"], change: Float[Array, "k 3 block"]) -> Bool[Array, "k block"]:
-    """Which neighbors have another color than the point: one nearer to that which differs most from its own."""
+    """Which neighbors have another color than the point: those closer to the most different color than to its own."""
     differing = jax.lax.optimization_barrier(weight * jnp.sum(change**2, axis=1))
     most = (differing == jnp.max(differing, axis=0)[None]).astype(weight.dtype)
     axis = total(most[:, None] * change) / total(most)[None]
@@ -224,7 +224,7 @@ def _part(weight: Float[Array, "k block"], change: Float[Array, "k 3 block"]) ->
 
 
 def _trust(own: Float[Array, "sums block"], other: Float[Array, "sums block"], rules: Rules) -> Float[Array, " block"]:
-    """How sure it is that the colors are two, from the moments of square roots of linear colors."""
+    """Confidence that there are two colors, from the moments of square roots of linear colors."""
     apart = _mean(other, ROOTS) - _mean(own, ROOTS)
     whole = own + other
     variance = larger(whole[SPREAD] - dot(whole[ROOTS], whole[ROOTS]), 1e-9)
@@ -241,10 +241,10 @@ def _find_line(
     other: Float[Array, "sums block"],
     rules: Rules,
 ) -> tuple[Float[Array, "2 block"], Float[Array, " block"], Float[Array, " block"]]:
-    """Unit way across the line, its distance along it, and the share of neighbors on the wrong side.
+    """Unit direction across the line, distance of the line along it, and the share of neighbors on the wrong side.
 
-    The way is that of a linear regression of the side; the line lies midway between the last of the point's color and
-    the first of the other.
+    The direction is that of a linear regression of the side.  The line lies midway between the last point of the own
+    color and the first point of the other.
     """
     one, two = (0.5 / larger(sums[:1], 1e-6) * sums[:6] for sums in (own, other))
     (n, x, y, xx, xy, yy), side = one + two, two - one
@@ -262,7 +262,7 @@ def _find_line(
 
 
 def _solve_plane(normal: Float[Array, "3 columns block"], ridge: float) -> Float[Array, "2 sides block"]:
-    """Slopes of a regression over the plane, from its normal equations beside their right sides."""
+    """Slopes of a linear regression over the plane, from its normal equations beside their right-hand sides."""
     stiff = jnp.diag(jnp.asarray([1e-6, ridge, ridge], normal.dtype))[..., None]
     return solve(normal[:, :3] + stiff, normal[:, 3:])[1:]
 

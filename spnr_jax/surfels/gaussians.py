@@ -1,18 +1,18 @@
-"""Gaussian splats on the surface in pictures of an object, with the colours of these pictures; pure functions.
+"""Gaussian splats on an object's surface, fitted to pictures of it; pure functions.
 
 Harmonics: real spherical harmonics as in splat viewers, degrees 0 to 3, with the Condon-Shortley phase, in the order of
 Kerbl et al. 2023 and of KHR_gaussian_splatting: by degree, then by order from -degree to degree.
 
-Places: pixels of all views are unprojected to their depth, and the nearest surfel gives the normal of each, turned to
-the viewer.  A pixel far from it is no surface (a depth between two surfaces).  Pixels that share a cube and face the
-same way, by the largest component of the normal, become a splat at their mean, so a thin sheet has one on each side.
-The cubes are as small as the wanted number of splats allows, and no smaller than the pixels.
+Positions: the pixels of all views are unprojected with their depth.  The nearest surfel gives each its normal, turned
+to the viewer.  A pixel far from all surfels is dropped (its depth lies between two surfaces).  Pixels in the same cube
+whose normals have the same dominant axis and sign become one splat at their mean, so a thin sheet has splats on both
+sides.  The cubes are as small as the requested number of splats allows, but not smaller than the pixels.
 
 Colours: spherical harmonics by weighted least squares over the views that see each splat.  A view sees a splat that
-faces it and whose centre lies at the picture's depth there.  It contradicts a splat that lies before that depth or
-where the picture is empty.  Splats that more than a few views contradict stick out of the object and are left out.  The
-weight of a view is the cosine of its angle to the normal; a ridge penalty on higher degrees gives a plain colour where
-few views see the splat.
+faces it and whose centre lies at the picture's depth.  It contradicts a splat that lies in front of that depth, or
+where the picture is empty.  Splats that many views contradict stick out of the object and are dropped.  The weight of a
+view is the cosine of its angle to the normal.  A ridge penalty on the higher degrees gives a constant colour where few
+views see the splat.
 """
 
 from collections.abc import Sequence
@@ -36,12 +36,12 @@ HIGHEST = 3  # degree
 
 
 def coefficients(degree: int) -> int:
-    """How many harmonics there are up to a degree."""
+    """Number of harmonics up to a degree."""
     return (degree + 1) ** 2
 
 
 def degree_of(count: int) -> int:
-    """The degree of so many coefficients; ValueError if they are of none."""
+    """The degree that has this number of coefficients; ValueError if there is none."""
     for degree in range(HIGHEST + 1):
         if coefficients(degree) == count:
             return degree
@@ -49,7 +49,7 @@ def degree_of(count: int) -> int:
 
 
 def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArray, "*batch coefficients"]:
-    """All harmonics up to a degree, 0 to 3, of unit vectors; of NumPy arrays as NumPy arrays."""
+    """All harmonics up to a degree, 0 to 3, of unit vectors; NumPy in, NumPy out."""
     x, y, z = (directions[..., i] for i in range(3))
     xx, yy, zz = x * x, y * y, z * z
     values = [C0 + 0 * x]
@@ -67,18 +67,18 @@ def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArra
 
 
 def half_turn_signs(degree: int) -> Float[np.ndarray, " coefficients"]:
-    """Signs of the coefficients of a colour that is turned half around the x axis: (x, y, z) -> (x, -y, -z)."""
+    """Signs of the coefficients after half a turn of the colour around the x axis: (x, y, z) -> (x, -y, -z)."""
     place = np.array([0.36, 0.48, 0.8])
     return np.sign(basis(place * [1, -1, -1], degree) * basis(place, degree))
 
 
-STRIDE = 2  # of the pixels that are carried back
-WITHIN, OFF_PLANE = 1.2, 0.5  # spacings of a surfel from which and above whose plane a pixel belongs to it
-GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth says little
-FINEST = 1.25  # pixels of the pictures that a cube is wide at least
-WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in cubes, opacity
-INSET = 0.5  # pixels that a splat lies below the surface: at outlines many are seen from their edge, and all reach out
-TRIES, ENOUGH = 6, 0.85  # sizes of cubes that are tried, share of the wanted number that is good
+STRIDE = 2  # every second pixel of each axis is unprojected
+WITHIN, OFF_PLANE = 1.2, 0.5  # spacings: largest distance of a pixel to its surfel, and to the surfel's plane
+GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth is unreliable
+FINEST = 1.25  # least side of a cube, in pixels of the pictures
+WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in sides of a cube; opacity
+INSET = 0.5  # pixels that splats lie below the surface: at outlines, many are seen edge-on, and all extend outward
+TRIES, ENOUGH = 6, 0.85  # cube sizes that are tried; share of the requested number that suffices
 
 
 class View(NamedTuple):
@@ -91,17 +91,17 @@ class View(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Pixels carried back: places, and normals towards the viewer."""
+    """Unprojected pixels: positions, and normals that face the viewer."""
 
     position: Float[np.ndarray, "pixels 3"]
     normal: Float[np.ndarray, "pixels 3"]
 
 
 def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> Seen:
-    """The places of the surface that the views show; ValueError if they show none."""
+    """The surface points that the views show; ValueError if they show none."""
     found, rays = [], []
     for i, view in enumerate(views):
-        row, column = i % stride, i // stride % stride  # another share of the pixels in each view
+        row, column = i % stride, i // stride % stride  # each view uses other pixels
         of = camera_rays(view.camera)
         depth = view.depth[row::stride, column::stride]
         hit = np.isfinite(depth)
@@ -124,7 +124,7 @@ def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRID
 
 
 def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
-    """Grey splats, at most so many, and the side of the cubes; `pixel` is the width of a pixel on the surface."""
+    """Grey splats, `most` or fewer, and the side of the cubes; `pixel` is the width of a pixel on the surface."""
     side = max(FINEST * pixel, 1e-9)
     low = seen.position.min(axis=0)
     for _ in range(TRIES):
@@ -152,7 +152,7 @@ def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
 
 
 def _groups(seen: Seen, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
-    """How many splats cubes of this side make, and which one each pixel belongs to."""
+    """Number of splats for cubes of this side, and the splat to which each pixel belongs."""
     cube = ((seen.position - low) / side).astype(np.int64)
     axis = np.abs(seen.normal).argmax(axis=1)
     face = 2 * axis + (np.take_along_axis(seen.normal, axis[:, None], axis=1)[:, 0] > 0)
@@ -173,27 +173,27 @@ def rotations(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "s
 
 
 def turn_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
-    """Quaternions w x y z that turn the third axis to a normal, some after half a turn around the first axis."""
+    """Quaternions w x y z that rotate the third axis to a normal; some include half a turn around the first axis."""
     below = normal[:, 2:] < 0
     x, y, z = np.split(normal * np.where(below, -1, 1), 3, axis=-1)
     w, nothing = 1 + z, np.zeros_like(z)
     upright = np.concatenate([w, -y, x, nothing], axis=-1)
-    turned = np.concatenate([y, w, nothing, -x], axis=-1)  # the same rotation behind that half turn
+    turned = np.concatenate([y, w, nothing, -x], axis=-1)  # the same rotation after that half turn
     quaternion = np.where(below, turned, upright)
     return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
 
 
 BEHIND = 2.0  # sides of a cube that a splat may lie behind a picture's depth
-SOLID = 0.6  # opacity from which a pixel has a colour of its own
-LEAST_FACING = 0.05  # weight of a splat that is seen from its edge
-RIDGE = 0.4  # in views
-BEFORE = 2.5  # sides of a cube before a picture's depth from which a view is against a splat
+SOLID = 0.6  # opacity above which a pixel has a reliable colour
+LEAST_FACING = 0.05  # weight of a splat that is seen edge-on
+RIDGE = 0.4  # of the higher degrees; its unit is one view
+BEFORE = 2.5  # sides of a cube in front of a picture's depth beyond which the view contradicts a splat
 EMPTY = 0.5  # opacity below which a picture is empty
-FEW, ALWAYS = 0.12, 0.5  # views against a splat that do not count: share of those that see it, and number
+FEW, ALWAYS = 0.12, 0.5  # contradicting views that are tolerated: share of the views that see the splat, plus a number
 
 
 def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
-    """The splats in the colours of the views, of a degree 0 to 3; without those that no view sees."""
+    """The splats with colours fitted to the views, up to a degree 0 to 3; splats that no view sees are dropped."""
     position = np.asarray(gaussians.position)
     normal = rotations(np.asarray(gaussians.rotation))[:, :, 2]
     count = coefficients(degree)
@@ -210,7 +210,7 @@ def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: i
             near = inside & (distance < depth + BEHIND * side)
             before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
         against += before | (inside & (opacity < EMPTY))
-        cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on either side
+        cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on both sides
         visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
         facing = cosine[visible]
         weight = np.maximum(facing, LEAST_FACING)[:, None].astype(np.float32)
@@ -230,12 +230,12 @@ def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: i
 
 
 def nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """The least depth of a pixel and those around it, infinite where none has one: depth is blurred where it jumps."""
+    """Least depth of each pixel and its neighbours, infinite where there is none: depth is blurred at its jumps."""
     return minimum_filter(np.where(np.isnan(depth), np.inf, depth), 3)
 
 
 def _pixels(position: Float[np.ndarray, "splats 3"], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row and column of the pixel that each place lies in, and whether it lies in one."""
+    """Row and column of the pixel that each position projects to, and whether it lies in the image."""
     pose, k = np.asarray(camera.cam_to_world), np.asarray(camera.intrinsics)
     local = (position - pose[:, 3]) @ pose[:, :3]
     ahead = -local[:, 2] > 1e-6

@@ -1,20 +1,20 @@
 """Surfels from points: the surface around each point, estimated by one pure program over given neighbors.
 
-neighbors   the nearest points of each point: topology, found once on the host by a k-d tree; data without a gradient
-spacing     side of the square that a point represents, from the neighbors on its own layer of the surface
-normal      given, or that of the layer where none is (layers.py), outward by votes of directions and walls (sides.py)
-sided       1 where the votes decide which side is outside, 0 where both are equally visible (a sheet)
-border      of two colors, where one lies within a disc, and the jump beyond it (discs.py)
+neighbors   the nearest points of each point, found once on the host with a k-d tree; integers without a gradient
+spacing     side of the square that a point represents, from the neighbors on the same layer of the surface
+normal      given, or else that of the layer (layers.py); the outer side is found by votes (sides.py)
+sided       1 where the votes agree on the outer side, 0 where both sides are equally visible (a sheet)
+border      a straight border between two colors inside a disc, and the jump of color across it (discs.py)
 rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
 scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
-Points are processed in blocks, one after the other, so that a million fit into memory; a block reads its neighbors from
-arrays of all points, which are (columns, points) here.
+Points are processed in blocks, one after the other, so that a million fit into memory.  A block reads its neighbors
+from arrays of all points, which are (columns, points) in this file.
 
 Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
-are constants without a gradient: the neighbors, the plane that a layer is fitted from, which neighbor ends a disc or
-has another color, sides and flips of normals, and visibility from each direction.
+are constants without a gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a
+disc or has another color, sides and flips of normals, and visibility from each direction.
 """
 
 import dataclasses
@@ -36,11 +36,11 @@ from spnr_jax.surfels.sides import cell_of, grid_of, see_directions
 # --- neighbors, on the host -------------------------------------------------------------------------------------------
 
 
-BLOCK = 2**14  # points that are asked for at once
+BLOCK = 2**14  # points per query of the k-d tree
 
 
 def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
-    """Numbers of the 20 nearest points of each point, itself first; -1 where there are fewer, and of padding.
+    """Indices of the 20 nearest points of each point, itself first; -1 where there are fewer, and for padding.
 
     NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
     """
@@ -55,16 +55,16 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
 
 
 def nearest(positions: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 20"]:
-    """Numbers of the nearest of real points, -1 where there are fewer; each point is its own first neighbor."""
+    """Indices of the nearest points of real points, -1 where there are fewer; each point is its own first neighbor."""
     return _ask(cKDTree(positions), np.arange(len(positions)))
 
 
 def order_in_space(
     positions: Float[np.ndarray, "points 3"],
 ) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "points 20"]]:
-    """An order of the points in which close ones follow each other, and the neighbors of the points so ordered.
+    """An order of the points that keeps close points close in memory, and the neighbors of the points in that order.
 
-    Caches hold what a block of points that are so ordered gathers.
+    What a block of ordered points gathers fits into the cache.
     """
     tree = cKDTree(positions)
     order = tree.indices
@@ -75,14 +75,14 @@ def order_in_space(
 
 
 def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
-    """Neighbors of the tree's points of these numbers, -1 for none; a point comes first among those at its place."""
+    """Neighbors of the points with these indices, -1 for none; each point comes first, even among duplicates."""
     ranks = list(range(1, min(NEIGHBORS, tree.n) + 1))
     blocks = [asked[i : i + BLOCK] for i in range(0, len(asked), BLOCK)]
     found = np.concatenate([tree.query(tree.data[rows], ranks, workers=-1)[1].astype(np.int32) for rows in blocks])
     wrong = np.flatnonzero(found[:, 0] != asked)
     if len(wrong):
         own = found[wrong] == asked[wrong, None]
-        lost = ~own.any(axis=1)  # among too many at its place
+        lost = ~own.any(axis=1)  # the point is missing from its own list: it has too many duplicates
         own[lost, -1], found[wrong[lost], -1] = True, asked[wrong[lost]]
         found[wrong] = np.take_along_axis(found[wrong], np.argsort(~own, axis=1, kind="stable"), axis=1)
     return np.pad(found, [(0, 0), (0, NEIGHBORS - found.shape[1])], constant_values=-1)
@@ -92,9 +92,9 @@ def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "som
 
 
 class Points(NamedTuple):
-    """All points of a cloud as columns, zeros where they are padding, and the numbers of their neighbors.
+    """All points of a cloud as columns, zeros for padding, and the indices of their neighbors.
 
-    `given` says which came with a normal that has a side.
+    `given` says which points came with an oriented normal.
     """
 
     number: Int[Array, "k points"]
@@ -107,9 +107,9 @@ class Points(NamedTuple):
 def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rules: Rules = RULES) -> Surfels:
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
-    As many as points and in their order.  `mask` is False for padding.
+    One surfel per point, in the same order; `mask` is False for padding.
     `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  A given normal may have any
-    length; one of length 0 is none.
+    length; length 0 means that it is not given.
     """
     mask = jnp.asarray(cloud.mask)
 
@@ -149,11 +149,11 @@ def median(values: Float[Array, " points"], mask: Bool[Array, " points"]) -> Flo
 def map_blocks(
     work: Callable[..., Any], points: Points, columns: Float[Array, "columns points"], rules: Rules, *own: Any
 ) -> Any:
-    """What the work gives for each block of points, end to end.
+    """The results of `work` for all blocks of points, concatenated.
 
-    It is called with the neighborhoods of the block, which hold these columns of the neighbors, with the neighbors'
-    numbers, and with the rows of `own` arrays (..., points).  All numbers of a block travel in one array.  A gradient
-    keeps the inputs of a block alone and computes the block anew.
+    `work` receives the neighborhoods of a block (with these columns of the neighbors), the neighbors' indices, and the
+    block's part of the `own` arrays (..., points).  All values of a block travel in one array.  For the gradient, only
+    the inputs of a block are kept, and the block is computed again.
     """
     count = points.mask.shape[0]
     size = min(rules.block, count)
@@ -182,21 +182,21 @@ def map_blocks(
 
 
 def _split(values: Array, size: int, fill: int) -> Array:
-    """Columns of all points as blocks of so many, filled up."""
+    """Columns of all points, padded and split into blocks of this size."""
     blocks = -(-values.shape[1] // size)
     values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
     return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
 
 
 def _pack(tree: Any) -> Float[Array, "columns points"]:
-    """All arrays (..., points) of a tree below each other; truths as 0 and 1."""
+    """All arrays (..., points) of a pytree stacked into one; booleans become 0 and 1."""
     leaves = jax.tree.leaves(tree)
     kind = jnp.result_type(*(leaf.dtype for leaf in leaves if leaf.dtype != bool))
     return jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]).astype(kind) for leaf in leaves])
 
 
 def _unpack(packed: Float[Array, "columns points"], form: Any) -> Any:
-    """The tree of this form that was packed, of however many points."""
+    """The pytree that was packed, restored to the structure of `form`, for any number of points."""
     leaves, structure = jax.tree.flatten(form)
     found, first = [], 0
     for leaf in leaves:
@@ -215,10 +215,10 @@ def find_layers(
     sheets: bool,
     rules: Rules = RULES,
 ) -> tuple[Float[Array, " points"], Layer]:
-    """First spacings, and the layers of normals, which are unit vectors, or 0 where there is none.
+    """First spacings, and layers from unit normals (0 where there is none).
 
-    Normals are kept; sided ones have a side, and tell the sides of a wall apart.  Of two sheets nearer than a layer is
-    thick a point gets its own, where linear colors tell them apart.
+    Normals are kept.  If `sided`, they are oriented, and separate the two sides of a wall.  With `sheets`, a point near
+    two sheets closer than the thickness of a layer is assigned to one of them by its linear color.
     """
     roots = root(points.color)
 
@@ -250,7 +250,7 @@ def find_layers(
 def look(
     points: Points, normal: Float[Array, "3 points"], spacing: Float[Array, " points"], rules: Rules = RULES
 ) -> Float[Array, "64 points"]:
-    """How much each of 64 directions sees of each point."""
+    """Visibility of each point from each of 64 directions."""
     middle, grid = median(spacing, points.mask), grid_of(points.mask.shape[0])
     low, high = rules.bounds_seen
     bounded = jnp.clip(spacing, low * middle, high * middle)
@@ -264,7 +264,7 @@ def find_sides(
     seen: Float[Array, "64 points"],
     rules: Rules = RULES,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """Normals that point outward, and how sure that is."""
+    """Normals that point outward, and the confidence in that (`sided`)."""
     turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw, layer))
     position, raw, layer = fixed
     points = points._replace(position=position)
@@ -293,7 +293,7 @@ def describe(
     seen: Float[Array, "64 points"],
     rules: Rules = RULES,
 ) -> dict[str, Array]:
-    """The fields that follow from layers and sides (..., points)."""
+    """The fields of `Surfels` that follow from layers and sides (..., points)."""
     rough, weight, random = find_spacings(points, raw, layer, normal, sided, rules)
 
     def work(
@@ -326,7 +326,7 @@ def describe(
 def average_seen(
     points: Points, weight: Float[Array, "k points"], seen: Float[Array, "64 points"], rules: Rules = RULES
 ) -> Float[Array, "64 points"]:
-    """What directions see of each point, averaged over the nearest of its layer: a depth buffer of points is noisy."""
+    """Visibility averaged over the nearest neighbors on the same layer: a depth buffer of points is noisy."""
     size, rows, weight = min(rules.block, len(points.mask)), seen.T, jax.lax.stop_gradient(weight)
 
     def one(block: tuple[Array, Array]) -> Array:
@@ -344,7 +344,7 @@ def find_spacings(
     sided: Float[Array, " points"],
     rules: Rules = RULES,
 ) -> tuple[Float[Array, " points"], Float[Array, "k points"], Bool[Array, ""]]:
-    """Spacings, the neighbors' weights as points of the same layer, and whether the points are spread at random."""
+    """Spacings, weights of the neighbors as members of the same layer, and whether the points are random (not even)."""
 
     def weigh(
         hood: Hood, number: Array, raw: Array, layer: Layer, normal: Array, sided: Array
@@ -364,10 +364,10 @@ def find_spacings(
 def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
     """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
 
-    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, those of padding too.
-    The network's `params` are not needed by surfels; they stand here for networks that encode.  All clouds have one
-    structure, whether or not they have normals.  Gradients flow through the box as well: a shift of all points moves
-    the scene's centre.  What is a constant to them is said in `geometry.py`.
+    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, also in
+    padding.  Surfels do not use `params`; the argument is there for networks that encode.  The result has the same
+    structure with and without normals.  Gradients also flow through the normalisation: a shift of all points moves the
+    scene's centre.  The docstring of `geometry.py` lists what has no gradient.
     """
     del params
     inside, centre, scale = move_into_box(cloud)
@@ -375,7 +375,7 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
 
 
 def move_into_box(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
-    """The cloud in the box [-1, 1]^3, and the centre and scale of the way there."""
+    """The cloud normalised to the box [-1, 1]^3, and the centre and scale of this transform."""
     positions = jnp.asarray(cloud.positions)
     centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
     inside = clamp((positions - centre[None]) * scale, -1, 1)
@@ -401,7 +401,7 @@ def fit_box(
 def make_scene(
     cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], centre: Array, scale: Array, rules: Rules
 ) -> SurfelScene:
-    """Scene of a cloud in the box, of this centre and scale."""
+    """The scene of a cloud that is already in the box; centre and scale are those of its transform."""
     surfels = estimate_surfels(cloud, jnp.asarray(neighbors), rules)
     spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)

@@ -1,9 +1,9 @@
 """The layer of the surface that each point lies on: a plane that its neighbors support, then a quadric through it.
 
-At thin walls, stickers and edges, points of several layers lie side by side; colors, spacings and normals of different
-layers must not mix.  Two sheets that are closer than the thickness of a layer are separated by their colors.  Pure
-functions of a block of points, which is the last axis; k are the neighbors of a point, itself the first.  Lengths are
-in spacings unless stated otherwise.
+At thin walls, stickers and edges, points of several layers lie close together; their colors, spacings and normals must
+not mix.  Two sheets that are closer than the thickness of a layer are separated by their colors.  Pure functions of a
+block of points, which is the last axis; k is the axis of a point's neighbors, the point itself first.  *Height* is the
+distance of a neighbor from a plane or layer.  Lengths are in spacings unless stated otherwise.
 """
 
 from dataclasses import dataclass
@@ -32,92 +32,92 @@ from spnr_jax.kernels.numerics import (
 # --- the numbers of the estimates -------------------------------------------------------------------------------------
 
 
-NEIGHBORS = 20  # of a point, itself among them
+NEIGHBORS = 20  # of a point, which counts as its own first neighbor
 Pair = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """The numbers of the surfels' geometry: limits, standard deviations; of what fades, where it begins and is whole.
+    """The constants of the surfel estimation.  A pair is a range: bounds, or start and end of a ramp.
 
-    Lengths are in spacings of the points, weights count neighbors (a neighbor at its point's own place weighs 1),
-    cosines and shares have no unit.  Lengths in units of the box, whose half diagonal is 1, are marked.
+    Lengths are in spacings of the points, or in units of the box (half diagonal 1) where marked.  Weights count
+    neighbors (a neighbor at the point's own position weighs 1).  Cosines and shares have no unit.
     """
 
     # spacing
     first_disc: int = 6  # neighbors in the disc whose area gives the first spacing
-    least_spacing: float = 1e-5  # of the box, for points that coincide
-    alone: float = 0.1  # of the box, the spacing of a single point
-    own_disc: float = 5.5  # weight of the neighbors in the disc whose area gives the spacing
-    own_share: float = 0.6  # of the weight of the layer's neighbors, that disc's at most
-    bounds: Pair = (0.5, 1.6)  # of the spacing over the first one
-    most_even: float = 1.2  # of the same, where points are spread evenly: legs are not drawn fat
+    least_spacing: float = 1e-5  # in units of the box, for points that coincide
+    alone: float = 0.1  # in units of the box, for a single point
+    own_disc: float = 5.5  # summed weight of the neighbors in the disc whose area gives the spacing
+    own_share: float = 0.6  # upper bound of that weight: share of the layer's total weight
+    bounds: Pair = (0.5, 1.6)  # of the ratio of the spacing to the first spacing
+    most_even: float = 1.2  # upper bound of that ratio for even points: otherwise thin legs are drawn too thick
     smoothed: int = 9  # neighbors over which spacing and visibility are averaged
     near: float = 1.2  # standard deviation of the weight of a neighbor's distance
 
-    # layers: a plane that two neighbors span, then a quadric
-    paired: int = 8  # nearest neighbors whose pairs span the planes that are tried
-    sliver: float = 0.2  # sine between two of them from which on they span a plane
-    flat: float = 0.1  # height over a plane at which a point supports it half
-    trusted: float = 1.15  # weight of the plane of least squares: it is the better one where points are noisy
+    # layers: a plane through the point and two neighbors, then a quadric
+    paired: int = 8  # nearest neighbors whose pairs span the candidate planes
+    sliver: float = 0.2  # least sine of the angle between two neighbors that span a plane
+    flat: float = 0.1  # height above a plane at which a neighbor's support is one half
+    trusted: float = 1.15  # factor on the support of the least-squares plane, which is better where points are noisy
     rounds: int = 4  # of the quadric's fit
-    slope_ridge: float = 1e-3  # added to the normal equations
+    slope_ridge: float = 1e-3  # added to the normal equations for slopes
     bend_ridge: float = 0.1  # added for curvatures
-    mixed_ridge: float = 0.05  # added for the mixed curvature: half, so that no axes are preferred
+    mixed_ridge: float = 0.05  # added for the mixed curvature: half, so that the result does not depend on the axes
     step_ridge: float = 0.01  # added for a step between two colors
     start: float = 0.12  # standard deviation of a neighbor's height in the first round
-    scales: Pair = (0.04, 0.3)  # least and most standard deviation of the height later
-    spreads: float = 2.0  # this deviation over the mean height of those that count
-    loose: float = 2.0  # deviation of the layer that colors and spacings come from, over that of the fit
-    apart: float = 3.0  # deviations from which on a neighbor is of another layer
-    parallel: float = 0.8  # cosine between normals of layers that lie above each other
+    scales: Pair = (0.04, 0.3)  # bounds of that standard deviation in later rounds
+    spreads: float = 2.0  # that standard deviation over the mean absolute height of the layer's neighbors
+    loose: float = 2.0  # factor on the standard deviation for the layer that colors and spacings are taken from
+    apart: float = 3.0  # standard deviations beyond which a neighbor belongs to another layer
+    parallel: float = 0.8  # least cosine between the normals of parallel layers
 
-    # sheets: of two skins nearer than a layer is thick, that of the point's color
-    like: float = 0.1  # between square roots of linear colors, standard deviation of the weight as of one color
-    sheet_scale: float = 0.02  # least standard deviation of the height where colors tell sheets apart
-    agreed: float = 0.3  # share of the neighbors of a like color that are certain, from which on a point is believed
-    # may be two sheets, are certainly: the step over their thickness, the share of what is known of it that no slope
-    # or curvature explains, neighbors of each color, the step over its standard error
+    # sheets: two surfaces closer than the thickness of a layer; a point lies on the one of its color
+    like: float = 0.1  # standard deviation for the similarity of two colors, in square roots of linear colors
+    sheet_scale: float = 0.02  # lower bound of the standard deviation of heights where colors separate sheets
+    agreed: float = 0.3  # least share of certain points among the neighbors of similar color, for a point on a sheet
+    # thresholds for possible and for certain sheets: step over their thickness; share of the step's information that no
+    # slope or curvature explains; neighbors of each color; step over its standard error
     step_high: Pair = (1.5, 3.0)
     step_known: Pair = (0.3, 0.7)
     step_points: Pair = (1.0, 2.0)
     step_significant: Pair = (3.0, 6.0)
 
     # sides
-    wall: float = 1.5  # height within which another layer is the other side of a wall
-    wall_vote: float = 3.0  # weight of the wall's vote
-    turn: float = 0.5  # lean against a given normal from which it is turned
-    evidence: float = 1.0  # votes that a lean is measured against: few of them are none
-    sure_side: Pair = (0.15, 0.45)  # lean of the votes from which a side begins to count, and counts whole
-    bounds_seen: Pair = (0.5, 2.0)  # of a point's spacing over the median one, where directions look at it
-    leak: float = 0.02  # weight of a one-sided disc from behind: better than a hole
+    wall: float = 1.5  # height below which another layer is taken for the other side of a wall
+    wall_vote: float = 3.0  # weight of that vote
+    turn: float = 0.5  # a given normal is flipped if the lean against it exceeds this
+    evidence: float = 1.0  # regulariser in the denominator of the lean: a few votes alone decide nothing
+    sure_side: Pair = (0.15, 0.45)  # lean of the votes at which `sided` begins to rise and reaches 1
+    bounds_seen: Pair = (0.5, 2.0)  # of a point's spacing over the median one, for the visibility from directions
+    leak: float = 0.02  # weight of the back of a one-sided disc: better than a hole
 
     # ends of discs
-    rim_within: float = 2.2  # distance of the neighbors that tell where a layer ends
+    rim_within: float = 2.2  # neighbors within this distance determine where a layer ends
     sharp: float = 0.75  # cosine between normals below which two faces meet at an edge
     steep: float = 0.3  # sine between normals above which a plane cuts a disc
-    edge: float = 0.1  # that a disc goes beyond the line where another face cuts it
-    aligned: float = 0.8  # cosine between the way to such a line and one of a disc's four ways
-    beyond: float = 0.25  # that a surface goes beyond the last point of its layer
-    far: float = 4.0  # where a disc without an end ends
+    edge: float = 0.1  # by which a disc extends beyond the line where another face cuts it
+    aligned: float = 0.8  # least cosine between the direction to such a line and one of a disc's four directions
+    beyond: float = 0.25  # by which a surface extends beyond the last point of its layer
+    far: float = 4.0  # radius of a disc without an end
 
     # gaps between random points
-    even: float = 0.62  # median distance to the next point from which on points are spread evenly: gaps are holes
-    widest_gap: float = 2.2  # radius of the widest gap that is bridged
-    same_place: float = 5e-7  # half the square of a distance, below which a point is the same
-    bridged: float = 0.95  # from a disc to the middle of a gap, at most
+    even: float = 0.62  # median distance to the nearest point above which points count as even: their gaps are holes
+    widest_gap: float = 2.2  # radius of the largest gap that is bridged
+    same_place: float = 5e-7  # half the squared distance below which two points coincide
+    bridged: float = 0.95  # distance to the middle of a gap, in spacings as enlarged, at most
 
     # colors
-    border_within: float = 1.6  # standard deviation of the weight of a neighbor beside a border
-    border_least: float = 0.01  # weight from which on a neighbor's place bounds the line
+    border_within: float = 1.6  # standard deviation of a neighbor's weight by its distance, for borders
+    border_least: float = 0.01  # least weight at which a neighbor bounds the line
     contrast: Pair = (0.06, 0.16)  # between the two colors, in square roots of linear ones
-    parted: Pair = (0.8, 0.9)  # share of the colors' variance that is between the two
-    far_share: Pair = (0.03, 0.06)  # of the neighbors beyond the line
+    parted: Pair = (0.8, 0.9)  # share of the variance of the colors that lies between the two groups
+    far_share: Pair = (0.03, 0.06)  # share of the neighbors that lie beyond the line
     wrong_side: Pair = (0.05, 0.01)  # share of the neighbors on the wrong side of the line
-    border_ridge: float = 0.1  # of the line's regression
+    border_ridge: float = 0.1  # of the regression of the line
 
     # memory
-    block: int = 512  # points that are worked on at once: they stay in a core's cache
+    block: int = 512  # points per block: a block fits into a core's cache
 
 
 RULES = Rules()
@@ -127,8 +127,7 @@ RULES = Rules()
 
 
 class Hood(NamedTuple):
-    """Neighborhoods of a block of points: which neighbors exist (1 or 0), the way to each in units of the box, its
-    squared length, and the columns that were asked of each."""
+    """Neighborhoods: which neighbors exist (1 or 0), offsets in units of the box, squared lengths, gathered columns."""
 
     real: Float[Array, "k block"]
     offset: Float[Array, "k 3 block"]
@@ -137,7 +136,7 @@ class Hood(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Unit normals of either sign, the layer's thickness, the neighbors' height over it."""
+    """Unit normals of either sign, the layer's thickness, and the neighbors' heights above it."""
 
     normal: Float[Array, "3 block"]
     scale: Float[Array, " block"]
@@ -145,7 +144,7 @@ class Layer(NamedTuple):
 
 
 class Sheets(NamedTuple):
-    """The layers that points have if they lie on one of two sheets, whether they may, and whether that is certain."""
+    """Layers if points lie on one of two sheets; whether that is possible, and whether it is certain."""
 
     layer: Layer
     possible: Bool[Array, " block"]
@@ -153,7 +152,7 @@ class Sheets(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A layer, the neighbors' weights in it, their sums over products of unknowns, the step to those unlike."""
+    """A layer, the neighbors' weights, the sums of products of the unknowns, the step to neighbors of another color."""
 
     layer: Layer
     weight: Float[Array, "k block"]
@@ -164,9 +163,9 @@ class Fit(NamedTuple):
 def look_around(
     number: Int[Array, "k block"], place: Float[Array, "3 block"], columns: Float[Array, "columns all"]
 ) -> Hood:
-    """The neighborhoods of points at some places, from columns of all points, their positions the first three.
+    """The neighborhoods of points at given positions; the first three of the columns of all points are their positions.
 
-    Numbers of neighbors that do not exist are negative.
+    Indices of neighbors that do not exist are negative.
     """
     real = number >= 0
     found = gather(columns, number)
@@ -176,19 +175,19 @@ def look_around(
 
 
 def gather(columns: Float[Array, "columns all"], number: Int[Array, "k block"]) -> Float[Array, "k columns block"]:
-    """Columns of the neighbors; those of the first point where there is no neighbor."""
+    """Columns of the neighbors; where there is no neighbor, those of the first point."""
     axes = jax.lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(1,), start_index_map=(1,))
     found = jax.lax.gather(columns, jnp.maximum(number, 0)[..., None], axes, (len(columns), 1), mode="clip")
     return jax.lax.optimization_barrier(found)
 
 
 def select(chosen: Bool[Array, " block"], new: Array, old: Array | float | int) -> Array:
-    """Of each point (the last axis) the new values where it is chosen, the old ones elsewhere."""
+    """For each point (the last axis), the new values where `chosen`, else the old ones."""
     return jnp.where(chosen.reshape(*[1] * (new.ndim - 1), -1), new, old)
 
 
 def along(vectors: Float[Array, "k 3 block"], axis: Float[Array, "3 block"]) -> Float[Array, "k block"]:
-    """Components of the vectors along one axis for each point."""
+    """Components of each point's vectors along its axis."""
     return vectors[:, 0] * axis[0][None] + vectors[:, 1] * axis[1][None] + vectors[:, 2] * axis[2][None]
 
 
@@ -198,7 +197,7 @@ def _components(vectors: Array, axes: Array) -> tuple[Array, Array, Array]:
 
 
 def _pull_back_components(primals: tuple[Array, Array], cotangents: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """By vectors and axes: sums over the neighbors as JAX derives them are computed one number at a time on a CPU."""
+    """Gradients by vectors and axes.  XLA would compute the sums that JAX derives one number at a time on a CPU."""
     vectors, axes = primals
     given = jnp.stack(cotangents, axis=1)
     return jnp.stack([along(given, axes[:, i]) for i in range(3)], axis=1), sum_products(given, vectors)
@@ -213,14 +212,14 @@ def weigh_near(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Flo
 
 
 def weigh_height(layer: Layer, loose: float = 1.0) -> Float[Array, "k block"]:
-    """Weights of the neighbors by their height over the layer."""
+    """Weights of the neighbors by their height above the layer."""
     return jnp.exp(-0.5 * (layer.height / (loose * layer.scale)[None]) ** 2)
 
 
 def measure_covariance(
     hood: Hood, spacing: Float[Array, " block"], weight: Float[Array, "k block"]
 ) -> Float[Array, "3 3 block"]:
-    """Of the weighted neighbors, in squared spacings."""
+    """Covariance of the weighted neighbors, in squared spacings."""
     offset = hood.offset / spacing[None, None]
     terms = jnp.concatenate([jnp.ones_like(offset[:, :1]), offset], axis=1)
     sums = sum_products(weight[:, None] * terms, terms)
@@ -229,10 +228,10 @@ def measure_covariance(
 
 
 def find_planes(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Float[Array, "3 block"]:
-    """Unit normals of the planes through a point that two of its nearest span: that which most neighbors support.
+    """Unit normals: of the planes through the point and two of its nearest neighbors, the one with the largest support.
 
-    The plane of least squares is tried, too.  So a point at an edge gets the plane of one of the faces, not one between
-    them.  Which plane is chosen is a constant; its normal has a gradient.
+    The least-squares plane is a candidate, too.  So a point at an edge gets the plane of one face, not an average of
+    both.  The choice of the plane is constant for gradients; its normal has a gradient.
     """
     weight = weigh_near(hood, spacing, rules)
     narrowest = find_narrowest(measure_covariance(hood, spacing, weight))
@@ -261,7 +260,7 @@ def find_planes(hood: Hood, spacing: Float[Array, " block"], rules: Rules) -> Fl
 def begin_normals(
     hood: Hood, spacing: Float[Array, " block"], given: Float[Array, "3 block"] | None = None, *, rules: Rules
 ) -> tuple[Float[Array, "3 block"], Bool[Array, " block"]]:
-    """Given unit normals, which are firm; where there is none, or it is 0, those of planes, which are not."""
+    """Unit normals to start from, and which are firm: given ones are; where none is given (or 0), planes are fitted."""
     if given is None:
         return find_planes(hood, spacing, rules), jnp.zeros(spacing.shape, bool)
     firm = dot(given, given) > 0.5
@@ -281,11 +280,11 @@ def fit_layers(
     unlike: Float[Array, "k block"] | None,
     rules: Rules,
 ) -> tuple[Layer, Sheets | None]:
-    """Layers from first normals, which are kept if they are firm; of sheets, too, where neighbors are `unlike` a point.
+    """Layers from initial normals (firm ones are kept); also layers of sheets if `unlike` is given.
 
-    A layer is a quadric through its point (Cazals and Pouget 2003).  For sheets it is fitted once more with the step to
-    the neighbors of another color as one more unknown.  The border of two colors on a bent surface is no step: slope
-    and curvature beyond it explain as much.  Blocks in which no two colors lie among each other are not fitted again.
+    A layer is a quadric through its point (Cazals and Pouget 2003).  For sheets, the quadric is fitted again with one
+    more unknown: the step to the neighbors of another color (`unlike`).  A border of two colors on a curved surface is
+    not a step: slope and curvature explain it as well.  Blocks without mixed colors are not fitted again.
     """
     offset = jax.lax.optimization_barrier(hood.offset / spacing[None, None])
     weight, free = jax.lax.optimization_barrier((weight, 1 - firm.astype(weight.dtype)))
@@ -327,9 +326,9 @@ def _fit_quadric(
     slopes: Float[Array, " block"],
     rules: Rules,
 ) -> Fit:
-    """Fit in rounds to the neighbors that lie close to the layer before, with a least thickness.
+    """Fit in rounds: each weighs the neighbors by their height above the layer before; `least` bounds its thickness.
 
-    Those that are unlike lie a step from the quadric.  With 0 for `slopes` normals are kept.
+    Neighbors that are `unlike` the point lie one step off the quadric.  With `slopes` 0, the normals are kept.
     """
     ridge = _ridge(rules, weight.dtype)[: len(start.sums), : len(start.sums)]
 
@@ -348,7 +347,7 @@ def _fit_quadric(
         if unlike is not None:
             rest = height - solution[5][None] * unlike
         normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
-        away = total(own * jnp.abs(rest)) / larger(total(own) - 1, 0.5)  # it is at 0 itself
+        away = total(own * jnp.abs(rest)) / larger(total(own) - 1, 0.5)  # the point itself is at 0
         scale = clamp(rules.spreads * away, least, rules.scales[1])
         return Fit(Layer(normal, scale, height), own, sums[:, :-1], solution[-1]), rest
 
@@ -356,7 +355,7 @@ def _fit_quadric(
 
 
 def _ridge(rules: Rules, dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
-    """What is added to the normal equations of a quadric's slopes, curvatures, and a step between two colors."""
+    """Ridge terms of the normal equations for slopes, curvatures, and the step between two colors."""
     bend = rules.bend_ridge
     ridge = [rules.slope_ridge, rules.slope_ridge, bend, rules.mixed_ridge, bend, rules.step_ridge]
     return jnp.diag(jnp.asarray(ridge, dtype))[..., None]
@@ -365,12 +364,12 @@ def _ridge(rules: Rules, dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
 def _tell_apart(
     fit: Fit, unlike: Float[Array, "k block"], rules: Rules
 ) -> tuple[Bool[Array, " block"], Bool[Array, " block"]]:
-    """Whether the step is one between two sheets: perhaps, and certainly."""
+    """Whether the step separates two sheets: possibly, and certainly."""
     step, own = fit.step, fit.weight
     last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
     error = jnp.maximum(solve(fit.sums + _ridge(rules, step.dtype), last)[-1, 0], 1e-9)
     held, others, squares = total(own), total(own * unlike), total(own * unlike**2)
-    alone = jnp.maximum(squares - others**2 / jnp.maximum(held, 1e-9), 1e-9)  # were nothing else unknown
+    alone = jnp.maximum(squares - others**2 / jnp.maximum(held, 1e-9), 1e-9)  # if the step were the only unknown
     high = jnp.abs(step) / fit.layer.scale
     measured = high, 1 / (alone * error), _fewer(held, others), high * rules.spreads / jnp.sqrt(error)
     limits = rules.step_high, rules.step_known, rules.step_points, rules.step_significant
@@ -386,21 +385,21 @@ def agree_on_sheets(
     certain: Float[Array, "k block"],
     rules: Rules,
 ) -> Layer:
-    """The layers, those of sheets where enough neighbors of a like color are certain."""
+    """The layers; those of sheets where enough neighbors of similar color are certain."""
     like = (hood.real * (1 - unlike))[1:]
     sure = total(like * certain[1:]) > rules.agreed * jnp.maximum(total(like), 1e-6)
     return jax.tree.map(lambda new, old: select(sheets.possible & sure, new, old), sheets.layer, layer)
 
 
 def compare_colors(hood: Hood, roots: Float[Array, "k 3 block"], rules: Rules) -> Float[Array, "k block"]:
-    """How far the neighbors are of another color than the point, 0 to 1, by the square roots of linear colors."""
+    """Difference in color between each neighbor and the point, 0 to 1, in square roots of linear colors."""
     change = roots - roots[:1]
     return -jnp.expm1(-0.5 / rules.like**2 * jnp.sum(change**2, axis=1)) * hood.real
 
 
 def _fewer(held: Float[Array, " block"], others: Float[Array, " block"]) -> Float[Array, " block"]:
-    """Weights of the neighbors of the point's color or of others, out of all that are held, whichever are fewer."""
-    return jnp.minimum(others, held - others - 1)  # it is its own neighbor
+    """The smaller of two total weights: the neighbors of the point's color, and the others."""
+    return jnp.minimum(others, held - others - 1)  # the point is its own neighbor
 
 
 def weigh_layer(
@@ -411,7 +410,7 @@ def weigh_layer(
     normals: Float[Array, "k 3 block"],
     rules: Rules,
 ) -> Float[Array, "k block"]:
-    """Weight of each neighbor as one of the same layer: near the quadric, and turned to the same side."""
+    """Weight of each neighbor as a member of the same layer: close to the quadric, normal to the same side."""
     weight = hood.real * weigh_height(layer, rules.loose)
     weight = weight * jnp.where((sided > 0.5)[None], clamp(0.5 + along(normals, normal), 0, 1), 1)
     return jax.lax.optimization_barrier(jnp.concatenate([jnp.ones_like(weight[:1]), weight[1:]]))

@@ -1,10 +1,10 @@
 """Distant light and the part of it that reaches a surface: every function here is linear in the environment map.
 
-map       (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y), column c of w looks
-          along the azimuth phi = 2 pi (c + 0.5) / w, where the direction is (sin phi, 0, -cos phi) on the horizon
-tables    irradiance by normal, and the map blurred by the GGX lobes of LEVELS by mirrored direction (split-sum
-          approximation, Karis 2013), 32 x 64 texels each
-arriving  light that each surfel receives: irradiance from the directions that the surfel is visible from
+map       (height, 2 * height, 3), linear radiance, latitude-longitude: row 0 is straight up (+y); column c of w has the
+          azimuth phi = 2 pi (c + 0.5) / w, which is the direction (sin phi, 0, -cos phi) on the horizon
+tables    irradiance by normal, and the map blurred by GGX lobes of the roughnesses LEVELS by mirrored direction
+          (split-sum approximation, Karis 2013), 32 x 64 texels each
+arriving  irradiance of each surfel from the directions that it is visible from
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from spnr_jax.surfels.sides import DIRECTIONS
 
 
 def directions(height: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit directions through the middles of a map's texels."""
+    """Unit directions through the centres of a map's texels."""
     theta = np.pi * (np.arange(height) + 0.5) / height
     phi = np.pi * (np.arange(2 * height) + 0.5) / height
     across = np.sin(theta)[:, None]
@@ -34,14 +34,14 @@ def directions(height: int) -> Float[np.ndarray, "height width 3"]:
 
 
 def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
-    """Of the texels of a map, in steradian."""
+    """Solid angles of a map's texels, in steradian."""
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     rows = (edges[:-1] - edges[1:]) * np.pi / height
     return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
 
 
 def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
-    """A map of another size: each texel is the mean over its solid angle of those that it overlaps; energy is kept."""
+    """The map at another size: each texel is the mean, by solid angle, of those that it overlaps; energy is kept."""
     rows = _shares(
         -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
         -np.cos(np.pi * np.arange(height + 1) / height),
@@ -53,7 +53,7 @@ def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "
 
 
 def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Share of each old interval in each new one (new, old), from rising edges."""
+    """Share of each old interval in each new one (new, old), from sorted edges."""
     overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
     return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
 
@@ -63,19 +63,19 @@ def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 HEIGHT, WIDTH = 32, 64  # of a table
 ROOM = "room_light.npz"
-LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of roughness
-TOLD = 2  # the level whose values at the directions of the visibility stand for what comes from there
-SPECULAR = 0.04  # reflectance of what is not metal, seen from straight above
-LOBE = 8.0  # of the directions around the mirrored one whose visibility counts
-POLE = 1e-6  # sine of the angle to straight up or down within which a direction has no azimuth
+LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # roughnesses
+TOLD = 2  # index in LEVELS: this blurred table is sampled at the 64 visibility directions
+SPECULAR = 0.04  # reflectance of dielectrics at normal incidence
+LOBE = 8.0  # sharpness of the lobe of visibility directions around the mirrored one
+POLE = 1e-6  # sine of the angle to the poles of a map below which a direction has no azimuth
 Color = Sequence[float | int] | np.ndarray | jax.Array
 SH_BANDS = 9  # spherical harmonics up to degree 2
-ODD = (3, 4, 7), (1, 4, 5)  # of them, those that change their sign when the light is mirrored along x, or along y
+ODD = (3, 4, 7), (1, 4, 5)  # indices of the harmonics that change sign when the light is mirrored along x, or along y
 
 
 @cache
 def _lobes() -> Float[np.ndarray, "tables texels texels"]:
-    """Weights of the texels in each entry of the tables, those of a lobe adding up to 1."""
+    """Weights of the texels in each entry of the tables; the weights of a lobe add up to 1."""
     towards, area = directions(HEIGHT).reshape(-1, 3).astype(np.float32), solid_angles(HEIGHT).reshape(-1)
     cosine = np.maximum(towards @ towards.T, -1)
     lobes = [np.maximum(cosine, 0)]
@@ -88,7 +88,7 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
 
 
 def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
-    """The light of a map of any size whose width is twice its height; energy is kept.  Of a traced map a traced one."""
+    """The light of a map of any size whose width is twice its height; energy is preserved.  The map may be traced."""
     xp = namespace(envmap)
     small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
     tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
@@ -97,33 +97,33 @@ def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
 
 @cache
 def room_light() -> Light:
-    """The light of the package's room, which pictures have where no other is asked for.
+    """The light of the package's room, the default.
 
-    Kept in a file of the package: making it takes 1.4 s of a first picture.
+    It is read from a file of the package: computing it takes 1.4 s of the time to the first picture.
     """
     with (resources.files("spnr_jax") / "pretrained" / ROOM).open("rb") as file:
         return Light(tables=np.load(file, allow_pickle=False)["tables"])
 
 
 def ambient(color: Color = (1, 1, 1)) -> Light:
-    """The same radiance from everywhere."""
+    """The same radiance from all directions."""
     xp = namespace(color)
     return light_of(xp.broadcast_to(xp.asarray(color, np.float32), (HEIGHT, WIDTH, 3)))
 
 
 def background(light: Light, towards: list[Array]) -> list[Array]:
-    """Radiance of the map itself at unit directions, colours as columns."""
+    """Radiance of the map at unit directions, colours as columns."""
     return look_up(jnp.asarray(light.tables[1]).reshape(-1, 3), towards)
 
 
 def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array | int = 0) -> list[Array]:
-    """Bilinear values of flattened tables at unit directions, given and returned as columns.
+    """Bilinear lookup in flattened tables at unit directions, given and returned as columns.
 
-    `first` is the row at which a table begins, for each direction.
+    `first` is, for each direction, the row at which its table begins.
     """
     x, y, z = towards
     across = root(x * x + z * z)
-    aside = across > POLE  # straight up and down there is no azimuth, nor a gradient by it
+    aside = across > POLE  # at the poles there is no azimuth, nor a gradient by it
     polar = jnp.arctan2(jnp.where(aside, across, 0), jnp.where(aside, y, jnp.where(y < 0, -1, 1)))
     azimuth = jnp.arctan2(jnp.where(aside, x, 0), jnp.where(aside, -z, 1))
     row, column = polar / jnp.pi * HEIGHT - 0.5, azimuth / (2 * jnp.pi) % 1.0 * WIDTH - 0.5
@@ -140,12 +140,12 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
 
 
 def irradiance(light: Light, normal: list[Array]) -> list[Array]:
-    """Irradiance over pi of unshadowed surfaces, colours as columns."""
+    """Irradiance / pi of unshadowed surfaces, colours as columns."""
     return look_up(jnp.asarray(light.tables[0]).reshape(-1, 3), normal)
 
 
 def reflect(light: Light, towards: list[Array], roughness: Array) -> list[Array]:
-    """Radiance that unshadowed surfaces mirror: between the tables of the two nearest roughnesses."""
+    """Prefiltered radiance of unshadowed surfaces, interpolated between the two nearest roughnesses."""
     level = clamp(roughness, 0, 1) * (len(LEVELS) - 1)
     below = jnp.clip(jnp.floor(level), 0, len(LEVELS) - 2)
     share, first = level - below, (1 + below.astype(jnp.int32)) * (HEIGHT * WIDTH)
@@ -155,7 +155,7 @@ def reflect(light: Light, towards: list[Array], roughness: Array) -> list[Array]
 
 
 def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
-    """Factor and summand of the reflectance at normal incidence, integrated over the lobe (Karis' fit, 2014)."""
+    """Scale and bias of the reflectance at normal incidence, integrated over the lobe (Karis' fit, 2014)."""
     one = [r * s + o for r, s, o in ((roughness, -1, 1), (roughness, -0.0275, 0.0425))]
     two = [r * s + o for r, s, o in ((roughness, -0.572, 1.04), (roughness, 0.022, -0.04))]
     grazing = smaller(one[0] ** 2, 2.0 ** (-9.28 * cosine)) * one[0] + one[1]
@@ -163,7 +163,7 @@ def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
 
 
 def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
-    """Irradiance over pi at each surfel through the directions that see it."""
+    """Irradiance / pi of each surfel from the directions that it is visible from."""
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     tables = jnp.asarray(light.tables)[1 + TOLD].reshape(-1, 3)
     radiance = jnp.stack(look_up(tables, [jnp.asarray(x) for x in DIRECTIONS.T]), axis=-1)
@@ -180,7 +180,7 @@ def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def project_harmonics(light: Light, rotation: Float[AnyArray, "3 3"]) -> Float[Array, "9 3"]:
-    """Spherical harmonics of the map over pi in the axes of a camera, columns of cam_to_world."""
+    """Spherical harmonics of the map over pi, in camera axes (the columns of cam_to_world)."""
     towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
     basis = jnp.stack(harmonics(*towards.T)) * jnp.asarray(solid_angles(HEIGHT).reshape(1, -1))
     return jnp.einsum("bt,tc->bc", basis, jnp.asarray(light.tables)[1].reshape(-1, 3), precision="highest") / jnp.pi

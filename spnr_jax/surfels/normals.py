@@ -1,6 +1,6 @@
-"""Normals of points from all the points around them, and the points that are visible to one sensor.
+"""Normals of points from all points of a dense cloud, and the points that are visible to one sensor.
 
-A thinned cloud gets its normals from all points of the dense one: the kept points alone give worse normals.
+A thinned cloud gets its normals from the dense one: the kept points alone give worse normals.
 """
 
 from functools import partial
@@ -19,14 +19,14 @@ from spnr_jax.surfels import geometry
 from spnr_jax.surfels.geometry import Points, order_in_space
 
 NEIGHBOURS = 16  # of a point, for the spacing
-REACH = 2.0  # standard deviation of the weight of a neighbour's distance: spacings, or as many deviations of the noise
-DISCS = 2.5  # of this radius, that hold the neighbours that are asked
-MOST = 128  # neighbours
-THICK = 0.15, 0.7  # standard deviation of the weight of a height over the plane: spacings, deviations of the noise
-FLAT, ROUGH = 32, 4.0  # neighbours whose thickness tells what a sensor's noise is, and times that thickness
-ROUNDS = 3  # in which neighbours that lie off the plane before count less
-ROWS = 2**12  # points that are worked on at a time: their neighbours fit into the cache
-CELL = 2.0  # spacings: pixel of a sensor
+REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance
+DISCS = 2.5  # times the points in a disc of that radius: number of neighbours
+MOST = 128  # neighbours at most
+THICK = 0.15, 0.7  # standard deviation of the weight by height: the larger of these spacings and noise deviations
+FLAT, ROUGH = 32, 4.0  # neighbours from whose thickness a sensor's noise is estimated; factor on that thickness
+ROUNDS = 3  # of robust reweighting
+ROWS = 2**12  # points per block: their neighbours fit into the cache
+CELL = 2.0  # width of a sensor's pixel, in spacings
 SAMPLE = 2048  # points at which the spacing is measured
 TINY = np.finfo(np.float64).tiny
 
@@ -34,17 +34,17 @@ TINY = np.finfo(np.float64).tiny
 def planes(
     positions: Float[np.ndarray, "points 3"], among: Float[np.ndarray, "all 3"], noise: float = 0.0
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals, of either sign, of the surface at some points from all points of their cloud.
+    """Unit normals, of either sign, at some points, from all points of their cloud (`among`).
 
-    Each is that of the plane of least squares through the neighbours, in rounds: those that lie off the plane before
-    count less, so that an edge gets one of its faces (moving least squares with robust weights, Fleishman et al. 2005).
-    `noise` is the standard deviation that the points had before they were averaged: it makes the neighbourhood wider.
+    Each is the normal of the least-squares plane of the neighbours.  Each round gives less weight to neighbours off the
+    previous plane, so that a point at an edge gets one of its faces (robust moving least squares, Fleishman et al.
+    2005). `noise` is the standard deviation of the points before they were averaged: it enlarges the neighbourhood.
     """
     return _planes(positions, cKDTree(among), noise)
 
 
 def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
-    """The normals of `planes` from a tree of all points."""
+    """The normals of `planes`, from a k-d tree of all points."""
     spacing = _spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
@@ -63,7 +63,7 @@ def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
 
 
 def _narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) along which weighted neighbours (n, k, 3) spread least."""
+    """Unit vectors (n, 3) of least variance of weighted neighbours (n, k, 3)."""
     share = weight / weight.sum(axis=1, keepdims=True)
     centred = offset - (share[:, None] @ offset)
     return np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
@@ -75,9 +75,9 @@ def facing(
     place: Float[np.ndarray, "3"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """The normals of `planes`, turned to the place of the sensor that saw the points.
+    """The normals of `planes`, turned to the position of the sensor that saw the points.
 
-    One sensor sees one side of everything, so that all heights over the planes count as noise, steps of depth as well.
+    One sensor sees only one side of each surface, so all heights above the planes count as noise, depth steps included.
     """
     tree = cKDTree(among)
     normals = _planes(positions, tree, max(noise, ROUGH * _thickness(tree)))
@@ -86,7 +86,7 @@ def facing(
 
 
 def _thickness(tree: cKDTree) -> float:
-    """Median over a sample of the points of how thick their neighbours lie about the plane of least squares."""
+    """Median thickness of a sample of neighbourhoods about their least-squares planes."""
     sample = tree.data[:: -(-tree.n // SAMPLE)]
     near = tree.data[tree.query(sample, list(range(1, min(FLAT, tree.n) + 1)), workers=-1)[1]]
     offset = near - near.mean(axis=1, keepdims=True)
@@ -96,7 +96,7 @@ def _thickness(tree: cKDTree) -> float:
 def find_visible(
     positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
 ) -> Bool[np.ndarray, " points"]:
-    """True for points that no other hides from the place: the first in each pixel, and up to so many spacings behind.
+    """True for points visible from the place: the first in each pixel, and others up to `behind` spacings behind it.
 
     The sensor looks at the middle of the points; its pixels are CELL spacings wide there.
     """
@@ -119,7 +119,7 @@ def find_visible(
 
 
 def spacing_of(positions: Float[np.ndarray, "points 3"]) -> float:
-    """Median side of the square that a point stands for, at a sample of the points; 0 of fewer than two."""
+    """Median side of the square that a point represents, from a sample of the points; 0 for fewer than two points."""
     return _spacing(cKDTree(positions))
 
 
@@ -134,13 +134,13 @@ def _spacing(tree: cKDTree) -> float:
 # --- thinned clouds ---------------------------------------------------------------------------------------------------
 
 
-VOTERS = 2**15  # points that votes are taken of, those that are kept among them
+VOTERS = 2**15  # points that take part in the votes, the kept points included
 
 
 def thin_cloud(points: Cleaned, kept: Int[np.ndarray, " points"]) -> PointCloud:
-    """The points of these numbers, (points, ...) float32; with normals from all where the columns have none.
+    """The points with these indices, (points, ...) float32; without given normals, they get normals from all points.
 
-    Where all are kept normals are not looked for: what draws the cloud estimates them from the same points.
+    If all points are kept, no normals are computed: the renderer estimates them from the same points.
     """
     values = {name: column[kept] for name, column in points.values.items()}
     if "normals" not in values and len(kept) < len(points.positions):
@@ -156,9 +156,9 @@ def outward_normals(
     kept: Int[np.ndarray, " points"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals of the points of these numbers; outward by the votes of directions and walls (sides.py).
+    """Unit normals of the points with these indices, outward by the votes of directions and walls (sides.py).
 
-    Linear colors tell sheets apart that nearly touch; `noise` is that of `planes`.
+    Linear colors separate sheets that nearly touch; `noise` is that of `planes`.
     """
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
@@ -177,7 +177,7 @@ def outward_normals(
     points = Points(
         number=columns(near, -1),
         mask=jnp.arange(size) < len(order),
-        given=jnp.zeros(size, bool),  # with a side
+        given=jnp.zeros(size, bool),  # whether the given normal is oriented
         position=columns(places[order]),
         color=columns(color[order]),
     )
@@ -188,7 +188,7 @@ def outward_normals(
 
 @partial(jax.jit, compiler_options=QUICKEST)
 def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
-    """The normals that are given, but for those of sheets, outward."""
+    """The given normals turned outward; those of two-sided sheets are kept."""
     raw, layer = geometry.find_layers(points, normals, sided=False, sheets=True)
     seen = geometry.look(points, layer.normal, raw)
     return geometry.find_sides(points, raw, layer, seen)[0]

@@ -1,13 +1,12 @@
 """Which side of a surface is outside: visibility from fixed directions, votes of these and of opposite walls.
 
-From each of 64 directions the points are drawn into a grid whose cells are CELL spacings wide, every point into the
-four cells around it, at the depth of its plane in the middle of the cell.  A point is visible if, lifted off the
-surface by a spacing, it lies before the depth in the grid; both depths are taken in the middle of its cell.  So no
-plane hides itself at any angle.  One pass over the points gives the outer side of a surface, ambient occlusion, and the
-share of any light that arrives.
+For each of 64 directions, the points are drawn into an orthographic depth buffer whose cells are CELL spacings wide:
+each point into the four cells around it, at the depth of its plane at the cell's centre.  A point is visible if, lifted
+off the surface by one spacing, it lies in front of the buffer.  Both depths are taken at the cell's centre, so a plane
+does not hide itself at any angle.  Visibility also gives ambient occlusion and the share of light that arrives.
 
-Votes are pure functions of a block of points, which is the last axis.  They flip a normal or leave it, and have no
-gradient.
+Votes are pure functions of a block of points, the last axis.  A *lean* is a signed vote: positive if the normal points
+outward.  Votes flip a normal or keep it, and have no gradient.
 """
 
 import jax
@@ -22,12 +21,12 @@ from spnr_jax.surfels.layers import Hood, Layer, Rules, along, weigh_height, wei
 
 
 NUM_DIRECTIONS = 64
-CELL = 1.5  # spacings
-STEEPEST = 8.0  # slope of a plane against the direction, at most
-REACH = 1.6  # spacings that a disc reaches: in a cell beyond that it counts at its point's own depth
-SOFT = 1.0  # spacings behind the depth buffer over which a point passes from seen to hidden
-COARSEST, FINEST = 256, 1024  # cells along the box at least and at most
-BOX = 2.2  # side of the square that every direction draws: the box's diagonal is 2
+CELL = 1.5  # width of a cell, in spacings
+STEEPEST = 8.0  # largest slope of a plane relative to the direction
+REACH = 1.6  # radius of a disc, in spacings: in cells beyond it, a point counts at its own depth
+SOFT = 1.0  # spacings behind the depth buffer over which visibility falls to 0
+COARSEST, FINEST = 256, 1024  # least and largest number of cells along a side
+BOX = 2.2  # side of the square that each buffer covers: the box's diagonal is 2
 
 
 def spiral(count: int) -> Float[np.ndarray, "count 3"]:
@@ -39,7 +38,7 @@ def spiral(count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Two unit vectors at right angles to each unit normal and to each other (Duff et al. 2017)."""
+    """Two unit vectors orthogonal to each unit normal and to each other (Duff et al. 2017)."""
     x, y, z = normals.T
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1 / (sign + z)
@@ -53,7 +52,7 @@ DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
 def grid_of(count: int) -> int:
-    """Cells along the depth buffers of so many points: their width follows the spacing where that covers the box."""
+    """Cells along a side of the depth buffers for so many points: CELL spacings wide, if that covers the box."""
     return int(min(max(16 * -(-(4 * count**0.5) // 16), COARSEST), FINEST))
 
 
@@ -71,10 +70,10 @@ def see_directions(
     *,
     grid: int,
 ) -> Float[Array, "64 points"]:
-    """How much each of DIRECTIONS sees of each point: 1 in front, 0 from two spacings behind the depth buffer on.
+    """Visibility of each point from each of DIRECTIONS: 1 in front, 0 from two spacings behind the depth buffer on.
 
-    A constant to gradients: a depth buffer jumps where one point passes before another.  The sign of a normal does not
-    matter.
+    Constant for gradients, because a depth buffer jumps where one point passes in front of another.  The sign of a
+    normal does not matter.
     """
     positions, normals, spacing, cell = jax.lax.stop_gradient((positions, normals, spacing, cell))
 
@@ -82,7 +81,7 @@ def see_directions(
         return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
 
     def beside(column, row, right, up, slopes):
-        """How much nearer a plane through (right, up), in cells, is in the middle of a cell."""
+        """How much nearer a plane through (right, up), in cells, is at the centre of a cell."""
         return cell * ((column + 0.5 - right) * slopes[0] + (row + 0.5 - up) * slopes[1])
 
     def look(axes):
@@ -118,7 +117,7 @@ def see_directions(
 def count_facing(
     normal: Float[Array, "3 points"], seen: Float[Array, "64 points"]
 ) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
-    """How many directions before each point see it, counted by their cosines with its normal, and how many behind."""
+    """Visibility summed over directions in front of each point, weighted by the cosine with its normal; and behind."""
 
     def add(sums: tuple[Array, Array], one: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
         counted = one[1] * dot(one[0], normal)
@@ -136,7 +135,7 @@ def share_votes(
     leans: Float[Array, "k block"],
     rules: Rules,
 ) -> Float[Array, " block"]:
-    """The lean of each point and of its neighbors on the same layer, whichever way their normals point."""
+    """Mean lean of each point and its neighbors on the same layer; opposite normals count with the opposite sign."""
     cosine = along(normals, layer.normal)
     weight = weigh_near(hood, spacing, rules) * weigh_height(layer) * cosine**2
     return total(weight * jnp.sign(cosine) * leans) / jnp.maximum(total(weight), 1e-6)
@@ -150,9 +149,9 @@ def vote_of_walls(
     given: Bool[Array, " block"],
     rules: Rules,
 ) -> Float[Array, " block"]:
-    """A lean from another layer, nearer than anything can be seen between: a wall's sides face away from each other.
+    """A lean from a parallel layer too close to be visible in between: the sides of a wall face away from each other.
 
-    A layer right under another, as under a sticker, is taken for a wall's inner side; given normals tell the two apart.
+    A layer just below another, as under a sticker, is taken for a wall's inner side; given normals tell them apart.
     """
     cosine = along(normals, layer.normal)
     other = jnp.where(given[None], -cosine, jnp.abs(cosine)) > rules.parallel
@@ -170,9 +169,9 @@ def turn_outward(
     given: Bool[Array, " block"],
     rules: Rules,
 ) -> tuple[Float[Array, "3 block"], Float[Array, " block"]]:
-    """Normals that point outward, and close to 1 where the votes say which side that is, 0 where they do not.
+    """Normals that point outward, and `sided`: near 1 where the votes decide which side that is, 0 where they do not.
 
-    Given normals have a side; they are turned only where the votes are clear.
+    Given normals are oriented; they are flipped only where the votes are clear.
     """
     begin, end = rules.sure_side
     sided = clamp((jnp.abs(towards) - begin) / (end - begin), 0, 1 - rules.leak)

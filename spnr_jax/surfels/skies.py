@@ -1,9 +1,9 @@
-"""Environment maps that are computed: skies, studios, lamps, random maps for training, and the package's room.
+"""Computed environment maps: skies, studios, lamps, random maps for training, and the package's room.
 
-A map is as `lighting.py` has it.  Maps add up and scale; none is normalised.
+Maps are as in `lighting.py`.  They add and scale; none is normalised.
 
-The room is furnished and has a window and lamps; it is computed, not stored: one ray per texel from its middle to the
-walls, floor and ceiling, each of which has its own colour under a diffuse estimate of the light of lamps and window.
+The room is furnished and has a window and lamps.  It is ray-cast, with one ray per texel from its centre to the walls,
+floor and ceiling.  Each of these has its own colour, lit by a diffuse estimate of the light of lamps and window.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from spnr_jax.surfels.lighting import Color, directions, light_of, solid_angles
 
 ROOM_MIN = np.array([-3.2, -1.3, -2.7])  # metres; the object floats at the origin
 ROOM_MAX = np.array([3.2, 1.6, 2.7])
-AMBIENT = 1.1  # light that has bounced more than once, the same everywhere
+AMBIENT = 1.1  # light of more than one bounce, the same everywhere
 
 # centre, normal, half extents along (x, y, z), emitted radiance: a window, two ceiling panels, a floor lamp's shade
 LIGHTS = (
@@ -30,7 +30,7 @@ LIGHTS = (
     ((-0.6, 1.6, 1.3), (0, -1, 0), (0.45, 0.0, 0.45), (13.0, 11.6, 9.4)),
     ((-3.2, 0.1, -1.7), (1, 0, 0), (0.0, 0.35, 0.3), (7.0, 5.2, 3.2)),
 )
-# centre, half extents, linear colour: things that stand before the walls, seen as soft patches of colour
+# centre, half extents, linear colour: furniture along the walls, drawn as soft patches of colour
 FURNITURE = (
     ((-3.2, -0.8, 0.6), (0.3, 0.5, 1.2), (0.30, 0.06, 0.04)),  # a red sofa
     ((0.6, -0.2, -2.7), (0.7, 1.0, 0.3), (0.16, 0.09, 0.05)),  # a dark bookcase
@@ -77,7 +77,7 @@ def surface_color(positions: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def irradiance(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the light (*batch, 3) that the lamps throw on surface points, each lamp taken as 2 x 2 spots."""
+    """Return the irradiance (*batch, 3) of surface points by the lamps, each approximated by 2 x 2 point lights."""
     total = np.zeros(positions.shape)
     steps = (-0.5, 0.5)
     for centre, normal, half, emitted in LIGHTS:
@@ -95,7 +95,7 @@ def irradiance(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def soft_box(positions: np.ndarray, centre, half, softness: float) -> np.ndarray:
-    """Return 1 inside the box, 0 outside, (*batch,), passing smoothly over `softness` metres at its faces."""
+    """Return 1 inside the box, 0 outside, (*batch,), with a smooth step of `softness` metres at its faces."""
     depth = (np.asarray(half) - np.abs(positions - np.asarray(centre))) / softness
     ramp = np.clip(0.5 + 0.5 * depth, 0, 1)
     return (ramp * ramp * (3 - 2 * ramp)).prod(-1)
@@ -105,8 +105,8 @@ def soft_box(positions: np.ndarray, centre, half, softness: float) -> np.ndarray
 
 
 HEIGHT = 128
-HORIZON = 0.08  # sine of the elevation over which ground and sky pass into each other
-MIDDLE = 1 - 1e-7  # cosine of the angle from a lamp's middle, at most
+HORIZON = 0.08  # sine of the elevation over which ground and sky blend
+MIDDLE = 1 - 1e-7  # cosine of the angle from a lamp's centre, at most
 MOST_LAMPS = 4  # of a random map
 
 Angle = float | int | np.floating | jax.Array  # degrees
@@ -114,14 +114,14 @@ Map = Float[AnyArray, "height width 3"]
 
 
 def towards(azimuth: Angle, elevation: Angle) -> Float[AnyArray, "3"]:
-    """Unit direction to a place of the sky, in degrees: azimuth 0 is +z, 90 is +x, elevation 90 straight up (+y)."""
+    """Unit direction from angles in degrees: azimuth 0 is +z, 90 is +x; elevation 90 is straight up (+y)."""
     xp = namespace(azimuth, elevation)
     turn, rise = xp.radians(azimuth), xp.radians(elevation)
     return xp.stack([xp.cos(rise) * xp.sin(turn), xp.sin(rise), xp.cos(rise) * xp.cos(turn)])
 
 
 def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT) -> Map:
-    """Sky from the horizon to straight above, and a floor of one colour."""
+    """A sky with a gradient from the horizon to the zenith, and a floor of one colour."""
     sine = directions(height)[..., 1:2]
     sky = np.asarray(horizon) + (np.asarray(zenith) - np.asarray(horizon)) * np.clip(sine, 0, 1) ** 0.7
     up = np.clip(0.5 + 0.5 * sine / HORIZON, 0, 1)
@@ -129,14 +129,14 @@ def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT)
 
 
 def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, height: int = HEIGHT) -> Map:
-    """A round lamp `size` degrees across, by what it throws on a surface that faces it; at least two texels wide.
+    """A round lamp of `size` degrees, at least two texels wide; `irradiance` is that of a surface that faces it.
 
-    Its edge is a quarter of its radius wide.
+    Its edge fades over a quarter of its radius.
     """
     xp = namespace(azimuth, elevation, size, irradiance)
     radius = xp.radians(xp.maximum(size / 2, 180 / height))
     cosine = xp.clip(directions(height) @ towards(azimuth, elevation), -MIDDLE, MIDDLE)
-    angle = xp.arccos(cosine)  # of no middle exactly, where it has no gradient
+    angle = xp.arccos(cosine)  # never 0, where arccos has no gradient
     ramp = xp.clip((1.125 - angle / radius) * 4, 0, 1)
     disc = ramp * ramp * (3 - 2 * ramp)
     held = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
@@ -144,15 +144,15 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
 
 
 def sun(azimuth: Angle, elevation: Angle, size: Angle = 3.0, color: Color = (1, 1, 1)) -> Light:
-    """A round lamp far away: degrees as `Model.camera` counts them, `size` across, irradiance of what faces it.
+    """A distant round lamp of `size` degrees; angles as in `Model.camera`; `color` is the irradiance facing it.
 
-    Each of these may be traced.  Shadows come from 64 directions, so they are never sharper than some ten degrees.
+    All arguments may be traced.  Visibility has 64 directions, so shadows are never sharper than about ten degrees.
     """
     return light_of(lamp(azimuth, elevation, size, color))
 
 
 def studio(height: int = HEIGHT) -> Map:
-    """Three softboxes before a grey backdrop."""
+    """Three softboxes in front of a grey backdrop."""
     grey = gradient((0.25,) * 3, (0.2,) * 3, (0.12,) * 3, height)
     key = lamp(-40, 40, 45, (1.9, 1.85, 1.8), height)
     fill = lamp(70, 15, 60, (0.5, 0.55, 0.6), height)
@@ -166,7 +166,7 @@ def sunset(height: int = HEIGHT) -> Map:
 
 
 def overcast(height: int = HEIGHT) -> Map:
-    """A white sky, brighter above, over a grey street."""
+    """A white sky, brighter towards the zenith, over a grey street."""
     return gradient((0.95, 0.98, 1.05), (0.5, 0.52, 0.55), (0.15, 0.14, 0.13), height)
 
 
@@ -202,6 +202,6 @@ def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
 
 
 def normalise(envmap: Map, white: float | int = 0.6) -> Map:
-    """The map scaled so that a white diffuse sphere, seen from all around, averages `white`: its mean radiance."""
+    """The map scaled to the mean radiance `white`: the average of a white diffuse sphere over all views."""
     mean = np.sum(envmap.mean(axis=-1) * solid_angles(len(envmap))) / (4 * np.pi)
     return (envmap * (white / max(mean, 1e-12))).astype(np.float32)

@@ -1,13 +1,13 @@
-"""Surfels splatted to a G-buffer: which pixels their discs cover, and those blended by layers, without order artefacts.
+"""Surfels splatted to a G-buffer: the pixels that discs cover, and their order-independent blending by layers.
 
-    entry       a pair of a disc and a pixel that it covers; entries are counted, made, and sorted by pixel and depth
-    kernel      1 - r^2, r the distance from the disc's centre in its plane over RADIUS spacings; a disc viewed edge-on,
-                or smaller than a pixel, is as wide as FLOOR pixels (the low-pass filter of EWA splatting, Zwicker et
-                al. 2001); an entry's weight is its square
-    layers      of a pixel's LIST front-most entries, those less than a spacing apart in depth blend and do not hide
-                each other; from two spacings on, the front entry hides the one behind
+    entry       a pair of a disc and a pixel that it covers; entries are counted, created, and sorted by pixel and depth
+    kernel      1 - r^2, r being the distance from the disc's centre in its plane, over RADIUS spacings; a disc viewed
+                edge-on or smaller than a pixel has a radius of FLOOR pixels (low-pass filter of EWA splatting, Zwicker
+                et al. 2001); an entry's optical depth is proportional to the square of the kernel
+    layers      of a pixel's LIST front-most entries, those less than a spacing apart in depth blend and do not occlude
+                each other; from two spacings on, the front entry occludes the one behind
     share       blend weight of an entry in its pixel: the shares of a layer add up to 1 - exp(-optical depth), times
-                the transmittance of the layers before it; over all layers they add up to the opacity
+                the transmittance before it; over all layers they add up to the opacity
 
 Weights fall to 0 at the rim of a disc, so a picture is continuous in the camera and in the points.  The pixels that a
 disc covers, and the order of the entries, are integers without a gradient.  Sizes are static; entries that do not fit
@@ -33,19 +33,19 @@ from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 
 RADIUS = 1.6  # of a disc, in spacings
-FLOOR = 1.0  # smallest radius on the picture, in pixels
-RIM_WIDTH = 0.4  # spacings over which a disc passes to 0 at the end of its layer
-SKIRT = 0.15  # of the kernel left beyond the end of a layer: for the network, which may know better where that is
-EDGE = 0.02  # cosine between ray and plane below which the plane counts as seen at this angle
-NEAREST = 0.05  # distance before the camera from which discs are drawn
-DEPTH_BITS, ENTRY_BITS = 19, 24  # of the sorted number of 64, at most; pixels have those above
-PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # that leave so many to the depth
+FLOOR = 1.0  # smallest radius of a disc in the picture, in pixels
+RIM_WIDTH = 0.4  # spacings over which a disc fades out at the end of its layer
+SKIRT = 0.15  # share of the kernel kept beyond the end of a layer, from which the network can correct that end
+EDGE = 0.02  # least cosine between ray and normal: smaller ones are replaced by it
+NEAREST = 0.05  # near plane: least distance from the camera at which discs are drawn
+DEPTH_BITS, ENTRY_BITS = 19, 24  # at most, of the 64 bits of a sort key; the bits above hold the pixel
+PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # if the depth has all its bits
 MOST_ENTRIES = 2**ENTRY_BITS
-MOST = 2**30  # that is counted: sums of int32 wrap beyond twice that
+MOST = 2**30  # largest count: sums of int32 overflow beyond twice that
 
 
 class Footprints(NamedTuple):
-    """Where each disc lies in the picture: camera coordinates, size, and the rectangle of pixels around it."""
+    """Projection of each disc: camera coordinates, size, and its bounding rectangle of pixels."""
 
     centre: tuple[Array, Array, Array]
     normal: tuple[Array, Array, Array]
@@ -60,9 +60,9 @@ class Footprints(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Pairs of disc and pixel; `order` sorts them by pixel and depth, `pixel`, `slot`, `rank` are sorted already.
+    """Pairs of disc and pixel.  `order` sorts by pixel and depth; `pixel`, `slot` and `rank` are already sorted.
 
-    A covered pixel has a slot, an entry its rank in the list of the slot.
+    A slot is the index of a covered pixel, a rank the position of an entry in its slot's list.
     """
 
     point: Int[Array, " entries"]
@@ -84,7 +84,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def footprints(surfels: Surfels, camera: Camera) -> Footprints:
-    """Discs before a camera; those turned away, behind it or beside the picture cover no pixel."""
+    """Discs projected to a camera; back faces and discs behind the camera or outside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     x, y, z = (
         a - b
@@ -126,7 +126,7 @@ def _rectangles(
     place: tuple[Array, Array],
     size: tuple[int | AnyArray, int | AnyArray],
 ) -> tuple[Array, Array, Array, Array]:
-    """First column and row, width and height of the pixels around each disc, inside the picture; width 0 beside it."""
+    """First column and row, width and height of each disc's bounding rectangle in the picture; width 0 outside it."""
     x, y, z = centre
     ahead = jnp.maximum(-z, NEAREST)
     nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
@@ -135,7 +135,7 @@ def _rectangles(
         (place[0], intrinsics[0, 0], x / ahead, normal[0], size[0]),
         (place[1], intrinsics[1, 1], y / ahead, normal[1], size[1]),
     ):
-        # a place of the disc at (dx, dz) from its centre lies focal * (dx + aside * dz) / (ahead - dz) beside it
+        # a point of the disc at (dx, dz) from its centre projects focal * (dx + aside * dz) / (ahead - dz) beside it
         extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
         half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
         first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, most)
@@ -150,7 +150,7 @@ def count_entries(covered: Int[Array, " points"]) -> Int[Array, ""]:
 
 
 def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
-    """Number of the pixels in the rectangles around discs, of a picture of so many rows and columns at most."""
+    """Number of pixels in the union of the discs' rectangles; `most` bounds the rows and columns of the picture."""
     rows, columns = (n + 1 for n in most)
     across = (foot.left, 1), (foot.left + foot.width, -1)
     down = (foot.top, 1), (foot.top + foot.covered // foot.width, -1)
@@ -162,17 +162,17 @@ def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
 
 
 def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, Int[Array, ""]]:
-    """The sorted entries of a picture, `room` of them with the empty ones, and how many did not fit in.
+    """The sorted entries of a picture, padded to `room`, and the number of those that did not fit.
 
-    Discs that do not fit are left out whole, the last ones of the surfels.
+    Discs that do not fit are left out as a whole, the last surfels first.
     """
     foot = footprints(surfels, camera)
-    end = jnp.cumsum(foot.covered.astype(jnp.float32))  # exact up to 2**24, and no int32 that wraps
+    end = jnp.cumsum(foot.covered.astype(jnp.float32))  # exact up to 2**24, and does not overflow as int32 would
     covered = jnp.where(end <= room, foot.covered, 0)
     lost = count_entries(jnp.where(end <= room, 0, foot.covered))
     end = jnp.cumsum(covered)
     point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=room)
-    # whole columns are gathered one by one, and not computed anew at every use: twenty times faster on a CPU
+    # gather whole columns once instead of at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
     rim = numerics.rotate_columns(rotation, surfels.rim)
     side = _cross(foot.normal, rim)
@@ -211,7 +211,7 @@ def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, In
 def _sort_entries(
     pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixel_bits: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
-    """Places and pixels in the order of pixel and depth: one number of 64 bits sorts nine times faster than three."""
+    """Order and pixels of the entries by pixel and depth: one 64-bit key sorts nine times faster than three arrays."""
     low, high = jnp.min(depth), jnp.max(depth)
     depth_bits = 64 - ENTRY_BITS - pixel_bits
     steps = 2**depth_bits - 1
@@ -225,20 +225,20 @@ def _sort_entries(
 # --- blending ---------------------------------------------------------------------------------------------------------
 
 
-OPACITY = 3.0  # optical depth at the middle of a disc
-LIST = 24  # entries of a pixel at most
-NEAR = 8  # places in the list before and after an entry that are compared in depth; those farther in front hide it
-THIN = 0.03  # optical depth of a layer below which its transmittance is a series
-LEAST_SHARE = 1e-4  # of the entries of a pixel together, that means are divided by
-SHARP = 4  # power of the kernel by which colours are blended more narrowly than everything else
-TOLD = 1e-12  # summed narrow weights from which on they say something; float32 holds the square
-FAR = 1e-4  # summed narrow weights that the centres' distances pass to 0 at
+OPACITY = 3.0  # optical depth at the centre of a disc
+LIST = 24  # largest number of entries of a pixel
+NEAR = 8  # entries before and after an entry in the list that are compared in depth; those farther in front occlude it
+THIN = 0.03  # optical depth of a layer below which its mean transmittance is a series
+LEAST_SHARE = 1e-4  # least summed share that means are divided by
+SHARP = 4  # power of the kernel for the narrower weights that colours are blended with
+TOLD = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
+FAR = 1e-4  # summed narrow weights below which the distances of the centres fade to 0
 
 
 def blend(
     found: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
 ) -> GBuffer:
-    """The G-buffer from the entries of a picture, of its first `slots` covered pixels (`count_covered_pixels`)."""
+    """The G-buffer from the entries of a picture, for its first `slots` covered pixels (`count_covered_pixels`)."""
     height, width = camera.height, camera.width
     table, pixel_of = _lists(found, slots, height * width)
     listed = table >= 0
@@ -260,7 +260,7 @@ def blend(
     sums = [_sum_rows(share, point, wide)]
     drawn, deep = jnp.sum(share, axis=0), jnp.sum(share * depth, axis=0)
     mean = deep / larger(drawn, LEAST_SHARE)
-    squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: of squares no digit would be left
+    squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: squares would lose all digits
     sums += [x[:, None] for x in (drawn, jnp.sum(weight * left, axis=0), mean, squared)]
     total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
     ahead = deep / jnp.where(total > TOLD, total, 1)
@@ -287,7 +287,7 @@ def _sum_rows(
 
 
 def _colors(surfels: Surfels) -> Float[Array, "points 10"]:
-    """Of each disc: its colour, the plane of its border, the jump there."""
+    """For each disc: its colour, the line of its border, and the jump of colour across it."""
     border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
     parts = surfels.base_color, surfels.border[:, :3], border[:, None], surfels.jump
     return jnp.concatenate(parts, axis=1)
@@ -301,9 +301,9 @@ def _sum_colors(
     ahead: Float[Array, " slots"],
     camera: Camera,
 ) -> Float[Array, "slots 5"]:
-    """Weighted sums of the colours that discs (`_colors`) have where the ray meets the surface, and of their centres.
+    """Weighted sums of the discs' colours (`_colors`) where the ray meets the surface, and of the discs' centres.
 
-    A border is a pixel wide.
+    A border is antialiased over one pixel.
     """
     right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
     up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
@@ -320,7 +320,7 @@ def _sum_colors(
 
 
 def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
-    """Numbers of the entries of each slot, -1 where there are fewer, and the pixel of each slot."""
+    """Indices of the entries of each slot, -1 where there are fewer, and the pixel of each slot."""
     live = (found.pixel < pixels) & (found.rank < LIST) & (found.slot < slots)
     place = jnp.where(live, found.rank * slots + found.slot, LIST * slots)
     table = jnp.full(LIST * slots, -1, jnp.int32).at[place].set(found.order, mode="drop", unique_indices=True)
@@ -333,9 +333,9 @@ def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list sl
 def shares(
     tau: Float[Array, "list slots"], depth: Float[Array, "list slots"], spacing: Float[Array, "list slots"]
 ) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"]]:
-    """Share of each entry in its pixel, and the transmittance before it, of lists sorted by depth.
+    """Share of each entry in its pixel, and the transmittance in front of it, for lists sorted by depth.
 
-    A layer of optical depth t has 1 - exp(-t), divided among its entries by theirs.
+    A layer of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
     """
     return _shares(tau, depth, spacing)
 
@@ -349,9 +349,9 @@ def _plain_shares(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Arra
 def _pull_back_shares(
     primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
 ) -> tuple[Array, Array, Array]:
-    """Gradients by tau, depth and spacing from those by share and transmittance; every pair is seen from both ends.
+    """Gradients by tau, depth and spacing from those by share and transmittance; each pair contributes to both entries.
 
-    That of the plain shares, as JAX derives it, takes twenty times as long as they do.
+    The gradient that JAX derives takes twenty times as long as the shares themselves.
     """
     tau, depth, spacing = primals
     by_share, by_left = cotangents
@@ -361,14 +361,14 @@ def _pull_back_shares(
     by_hidden = -left * (by_left + by_share * (tau * mean))
     by_tau = by_share * (left * mean) + by_band + jnp.matmul(_far(len(tau)).T, by_hidden, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
-    by_band, by_hidden = map(jax.lax.optimization_barrier, (by_band, by_hidden))  # one would be linear in all of these
+    by_band, by_hidden = map(jax.lax.optimization_barrier, (by_band, by_hidden))  # one would be linear in all
     known = tau, depth, spacing, by_band, by_hidden
     for step, (other_tau, *places, other_band, other_hidden) in _neighbours(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
         gap, middle = _gap(step, depth, spacing, *places)
         x = clamp(gap - 1, 0, 1)
         apart, slope = x * x * (3 - 2 * x), 6 * x * (1 - x)
         by_tau += other_band * (1 - apart) + (other_hidden * apart if step > 0 else 0)
-        through = tau * other_hidden if step > 0 else other_tau * by_hidden  # what is in front hides what is behind
+        through = tau * other_hidden if step > 0 else other_tau * by_hidden  # the front entry occludes the one behind
         by_gap = slope * (through - other_tau * by_band - tau * other_band)
         by_depth += np.sign(-step) * by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
@@ -379,7 +379,7 @@ _shares = numerics.with_gradient(_plain_shares, _pull_back_shares)
 
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
-    """Optical depth before each entry's layer, and that of the layer."""
+    """Optical depth in front of each entry's layer, and that of the layer."""
     hidden, band = jnp.matmul(_far(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
     for step, (other_tau, *places) in _neighbours((tau, depth, spacing), (0.0, 0.0, 1.0)):
         apart = smoothstep(_gap(step, depth, spacing, *places)[0] - 1)
@@ -390,14 +390,14 @@ def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Ar
 
 
 def _far(length: int) -> Array:
-    """1 where the column's entry stands too far before the row's in a list to be compared with it, and hides it."""
+    """1 where the column's entry is so far in front of the row's entry in the list that it occludes it untested."""
     return jnp.tril(jnp.ones((length, length)), -NEAR - 1)
 
 
 def _neighbours(
     lists: tuple[Array, ...], beyond: tuple[float, ...]
 ) -> Iterator[tuple[int, list[Float[Array, "list slots"]]]]:
-    """The lists of the entries so many places before and behind each, for all places that are compared."""
+    """The lists shifted by each of the compared distances, forwards and backwards."""
     padded = [
         jax.lax.optimization_barrier(jnp.pad(x, ((NEAR, NEAR), (0, 0)), constant_values=c))
         for x, c in zip(lists, beyond, strict=True)
@@ -407,13 +407,13 @@ def _neighbours(
 
 
 def _gap(step: int, depth: Array, spacing: Array, other_depth: Array, other_spacing: Array) -> tuple[Array, Array]:
-    """How far one of two entries lies behind the other in spacings, and the spacing between theirs."""
+    """Distance in depth between two entries in spacings, and the mean of their spacings."""
     middle = 0.5 * (spacing + other_spacing)
     return np.sign(-step) * (depth - other_depth) / middle, middle
 
 
 def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
-    """(1 - exp(-tau)) / tau, of a layer, and its derivative; by a series where no digit would be left."""
+    """(1 - exp(-tau)) / tau of a layer, and its derivative; a series for small tau, where all digits would cancel."""
     thin = tau < THIN
     thick = jnp.where(thin, 1, tau)
     mean = jnp.where(thin, 1 - tau * (1 / 2 - tau * (1 / 6 - tau / 24)), one_minus_exp(thick) / thick)
@@ -422,7 +422,7 @@ def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
 
 
 def _gather(sums: list[Array], features: int, camera: Camera) -> GBuffer:
-    """Means from the sums of `blend`."""
+    """Normalises the sums of `blend` to means."""
     wide, rest, narrow = sums[: features + 4], sums[features + 4 : features + 8], sums[features + 8 :]
     share, coverage, depth, squared = rest
     inverse = 1 / larger(share, LEAST_SHARE)

@@ -1,12 +1,12 @@
-"""Training data of the shader, and its loss: G-buffers of a data set's clouds, made once and kept on disk.
+"""Training data and loss of the shader: G-buffers of a data set's clouds, made once and cached on disk.
 
     FOLDER/OBJECT.CLOUD.npz    views of one random cloud of an object
         doublings              (views,): how often the network doubles each view's resolution
-        seen0, seen1, ...      its input for the view, in the window around the object, float16
+        seen0, seen1, ...      network input of each view, in the window around the object, float16
         maps, ambient, target  likewise: light maps in float16, the light's harmonics, the reference in 8 bits
 
-A file is a pure function of (seed, object, cloud); it appears whole or not at all; an unreadable one is made again.  A
-batch is a pure function of (seed, step) and the list of files: squares of views of equal doublings.
+A file is a pure function of (seed, object, cloud) and is written atomically; an unreadable one is made again.  A batch
+is a pure function of (seed, step) and the list of files; its crops have equal doublings.
 """
 
 import dataclasses
@@ -44,32 +44,32 @@ from spnr_jax.surfels import lighting, normals
 from spnr_jax.training.batching import colours_alone, random_scan, read_ahead
 from spnr_jax.training.weights import add_companions
 
-CLOUDS = 2  # of each object
-SCANNED = 0.3  # share of them that are scanned and cleaned
-UNKNOWN_MATERIALS = 0.1  # share of the clouds whose roughness and metallic are not known
-WITHOUT_NORMALS = 0.5  # share of the others whose normals are estimated
-ALONE = 0.5  # share of these whose normals are estimated from the points that are kept alone, as of a small file
-SIDES = (1, 1, 1, 1, 2, 4, 8)  # pixels of a reference averaged along a side, drawn from these
-SMALL, FEWER = 4, 8  # side from which on a cloud has at most so many times fewer points
-MOST_ENTRIES = 2**22  # of a view: one with more is left out
-LEAST = 8  # pixels along the shorter side of a view
-MARGIN, FAINT = 6, 0.01  # pixels around the window, and opacity from which on a pixel is in it
-SIZES = (96, 72, 48, 48, 32)  # pixels along a crop by doublings; of another config.crop than the first in proportion
-MARGINS = (0, 4, 8, 14, 10)  # of these, to each side, that the network sees and does not draw
+CLOUDS = 2  # per object
+SCANNED = 0.3  # share of the clouds that are simulated scans, cleaned
+UNKNOWN_MATERIALS = 0.1  # share of the other clouds whose roughness and metallic are unknown
+WITHOUT_NORMALS = 0.5  # share of the other clouds without given normals
+ALONE = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
+SIDES = (1, 1, 1, 1, 2, 4, 8)  # a view averages side x side pixels of its reference; drawn from these
+SMALL, FEWER = 4, 8  # from this side on, a cloud has at most 1 / FEWER of the points
+MOST_ENTRIES = 2**22  # of a view: one with more is dropped
+LEAST = 8  # least pixels along the shorter side of a view
+MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel belongs to it
+SIZES = (96, 72, 48, 48, 32)  # pixels along a crop, by doublings; scaled if config.crop is not the first
+MARGINS = (0, 4, 8, 14, 10)  # pixels on each side of a crop that are input but not output, by doublings
 SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
-TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # places that are tried for a crop, until this share of it has this opacity
-LARGEST = 6e4  # in float16; no light makes a picture brighter than white
-LEAST_INSIDE = 1.0  # pixels; where nothing of the object is seen its error is 0
-CLOUD, CROP = 3, 4  # streams of random numbers under one seed, beside those of `batching`
+TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # positions tried for a crop, until so large a share of it has this opacity
+LARGEST = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
+LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it is 0
+CLOUD, CROP = 3, 4  # random streams under one seed, in addition to those of `batching`
 
-ROOM = "procedural room"  # as the generator of data sets calls it
+ROOM = "procedural room"  # its name in data sets
 
 Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
 
 
 class View(NamedTuple):
-    """Where a view is kept, and how often its resolution is doubled."""
+    """The file and index of a stored view, and how often its resolution is doubled."""
 
     path: Path
     number: int
@@ -79,14 +79,14 @@ class View(NamedTuple):
 def prepare(
     config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None
 ) -> Callable[[int], Generator[Crops, None, None]]:
-    """A function of a step: training batches from there on.  Missing G-buffers are made first, which takes a while."""
+    """A function from a step to the training batches from there on.  Missing G-buffers are made first (slow)."""
     variables = add_companions(config.model, {}, run)
     views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
     return lambda first_step: batches(views, config, first_step)
 
 
 def light_of(dataset: Dataset) -> Light:
-    """The light of pictures that have none of their own; ValueError if it is another than the room."""
+    """The light of a data set without a light per view; ValueError if it is not the room."""
     described = dataset.settings.get("environment_map")
     name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
     if name != ROOM:
@@ -125,7 +125,7 @@ def loss(
 
 
 def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
-    """The views of the data set's objects; files that are missing or broken are made; `variables` densify."""
+    """The views of the data set; missing and broken files are made first; `variables` hold the densifier."""
     views = []
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
         paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
@@ -144,7 +144,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
 
 
 def _doublings(path: Path) -> list[int] | None:
-    """Of each view in a file; None if there is no file that can be read."""
+    """The doublings of each view in a file; None if the file is missing or unreadable."""
     try:
         with path.open("rb") as file:
             return read_arrays(file, ("doublings",))["doublings"].tolist()
@@ -153,7 +153,7 @@ def _doublings(path: Path) -> list[int] | None:
 
 
 def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
-    """The content of a file: views of the object's cloud of this number."""
+    """The content of a file: views of the object's cloud with this index."""
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
@@ -170,7 +170,7 @@ def make(item: ObjectData, number: int, light: Light, config: TrainConfig, varia
 
 
 def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: np.random.Generator) -> PointCloud:
-    """Random points of a cloud or evenly spread ones, with or without their normals, or what is left of a scan."""
+    """A random or farthest-point sample of a cloud, with or without normals, or of a simulated scan of it."""
     most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
     count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
     even = generator.random() < config.even_share and count <= MOST_EVEN
@@ -194,7 +194,7 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
 
 
 def scan(points: Cleaned, generator: np.random.Generator) -> Cleaned:
-    """The cloud as a scanner and cleaning leave it: without normals, in the box of the one that was scanned."""
+    """A simulated scan of the cloud, cleaned: without normals, in the box of the original cloud."""
     positions, values = random_scan(*points[:2], generator)
     values.pop("normals", None)
     left = clean_columns(positions, values)
@@ -208,10 +208,10 @@ def make_view(
     side: int,
     light: Light,
 ) -> tuple[int, Arrays] | None:
-    """Doublings and arrays of a view, `side` times smaller than its reference is kept; None if it teaches nothing."""
+    """Doublings and arrays of a view with `side` times fewer pixels along a side; None if it shows too little."""
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.resolution(scene, small)
-    # what is drawn at twice the size is compared at that size, or at the reference's where that has no more pixels
+    # drawn at twice the size, it is compared at that size, or at the reference's if that has no more pixels
     side, scale = max(side // finer, 1), 2**doublings
     if any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
         return None
@@ -240,18 +240,18 @@ def make_view(
 def look_at(
     surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
-    """What the network sees of a whole view, the light maps, and the light's harmonics."""
+    """Network input for a whole view, light maps, and spherical harmonics of the light."""
     buffer, _ = surfel_renderer.rasterize(surfels, camera, light, room=room, slots=slots)
     return surfel_renderer.look(buffer, light, camera)[:3]
 
 
 def _size(count: int, least: int) -> int:
-    """`least` times a power of four that holds the count: few sizes, few compilations."""
+    """The least `least` times a power of four that is not below the count: few sizes, few compilations."""
     return least * 4 ** max(-(-((count - 1) // least).bit_length() // 2), 0)
 
 
 def average_squares(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
-    """The picture `side` times smaller: each square's opacity, and its colour weighted by it."""
+    """The picture `side` times smaller: mean opacity of each square, and mean colour weighted by opacity."""
     alpha = image[..., 3:].astype(np.float32) / 255
     layers = np.concatenate([image[..., :3] / np.float32(255) * alpha, alpha], axis=-1)
     height, width = (n // side for n in image.shape[:2])
@@ -260,13 +260,13 @@ def average_squares(image: UInt8[np.ndarray, "height width 4"], side: int) -> UI
 
 
 def _around(inside: np.ndarray) -> slice:
-    """From the first to the last place that is inside, and a margin."""
+    """From the first to the last True entry, with a margin."""
     first, last = np.flatnonzero(inside)[[0, -1]].tolist()
     return slice(max(first - MARGIN, 0), min(last + 1 + MARGIN, len(inside)))
 
 
 def batches(views: list[View], config: TrainConfig, first_step: int) -> Generator[Crops, None, None]:
-    """Training batches from `first_step` on, assembled ahead."""
+    """Training batches from `first_step` on, prepared ahead."""
     by_doublings: dict[int, list[View]] = {}
     for view in views:
         by_doublings.setdefault(view.doublings, []).append(view)
@@ -275,7 +275,7 @@ def batches(views: list[View], config: TrainConfig, first_step: int) -> Generato
 
 
 def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:
-    """The batch of a step: crops of random views, by doublings, mirrored or not."""
+    """The batch of a step: crops of random views with equal doublings, randomly mirrored."""
     generator = np.random.default_rng((config.seed, CROP, step))
     shares = np.array([SHARES[doublings] for doublings in sorted(views)])
     doublings = int(generator.choice(sorted(views), p=shares / shares.sum()))
@@ -302,7 +302,7 @@ def read_view(view: View) -> Arrays:
 
 
 def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
-    """A square of a view that shows something of the object; empty beyond the view's ends."""
+    """A crop of a view that shows some of the object; padded with zeros beyond the view."""
     seen, inner = view["seen"], size - 2 * margin
     for _ in range(TRIES):
         top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in seen.shape[:2])
@@ -325,7 +325,7 @@ def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.
 
 
 def mirror(view: Arrays, axis: int) -> Arrays:
-    """The view of object, camera and light mirrored along x (axis 0) or y (axis 1) of the camera."""
+    """The view with object, camera and light mirrored along x (axis 0) or y (axis 1) of the camera."""
     flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
     return {
         **flipped,

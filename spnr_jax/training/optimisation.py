@@ -1,10 +1,10 @@
 """Training as pure functions: state in, state out.  Every method is trained by this step.
 
-One step evaluates the loss of the method (`methods.Method.loss`) once.  The discriminator, of methods that have one, is
-updated on the pictures of that forward pass, and the generator on the gradient that the updated discriminator and the
-method's loss send back through it.  `adversarial` is static: without it the graph contains no discriminator.  All
-randomness of step s comes from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.
-On a CPU the losses of several runs under vmap are computed one after the other.
+One step evaluates the method's loss (`methods.Method.loss`) once.  If there is a discriminator, it is updated first, on
+the images of that forward pass; the generator then gets the gradient of the method's loss and of the updated
+discriminator.  `adversarial` is static: without it the graph contains no discriminator.  All randomness of step s comes
+from fold_in(state.key, s), so a resumed run repeats the uninterrupted one bit for bit.  On a CPU, the losses of several
+runs under vmap are computed one after the other.
 """
 
 import dataclasses
@@ -24,13 +24,13 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import AnyArray, Batch, Key
 from spnr_jax.methods import method_of
 
-Judge = tuple[dict, tuple]  # parameters and optimiser of the discriminator
+Judge = tuple[dict, tuple]  # parameters and optimiser state of the discriminator
 
 
 @no_type_check
 @struct.dataclass
 class TrainState:
-    """Everything that a step changes; data only.  `averaged` is the generator that evaluation uses."""
+    """Everything that a step changes; data only.  `averaged` holds the moving averages that evaluation uses."""
 
     step: Array
     key: Key
@@ -56,7 +56,7 @@ def learning_rate(config: TrainConfig) -> optax.Schedule:
 
 
 def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """The generator's algorithm, and Adam for the discriminator."""
+    """The generator's optimiser, and Adam for the discriminator."""
     o = config.optimizer
     algorithm = {"adam": optax.adam, "radam": optax.radam}[o.algorithm]
     generator = algorithm(learning_rate(config), b1=o.beta1, b2=o.beta2)
@@ -67,7 +67,7 @@ def optimizers(config: TrainConfig) -> tuple[optax.GradientTransformation, optax
 
 
 def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainState:
-    """Fresh weights and optimisers from a seed, the config's by default."""
+    """Fresh weights and optimiser states from a seed (default: the config's)."""
     key = jax.random.key(config.seed if seed is None else seed)
     key, generator_key, discriminator_key = jax.random.split(key, 3)
     variables = method_of(config.model).init(generator_key, config.model)
@@ -92,7 +92,7 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
 
 
 def init_from(state: TrainState, variables: dict) -> TrainState:
-    """A fresh state with the generator of another training; ValueError if its weights are of another network."""
+    """A fresh state with the generator's weights from another training; ValueError if they are of another network."""
     params, stats = variables["params"], variables.get("batch_stats", {})
     needed = {"params": state.generator, "batch_stats": state.batch_stats}
     own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
@@ -126,14 +126,14 @@ def first_adversarial_step(config: TrainConfig) -> int:
 
 
 def discriminator_of(config: TrainConfig) -> Any:
-    """The discriminator's module."""
+    """The discriminator as a Linen module."""
     make = method_of(config.model).discriminator
     assert make is not None, "the config refuses an adversarial loss"
     return make(config)
 
 
 def logits(config: TrainConfig, params: dict, image: AnyArray, condition: AnyArray, mask: AnyArray) -> Array:
-    """What the discriminator says of the images under its parameters."""
+    """The discriminator's logits for the images."""
     if not config.loss.condition:
         condition, mask = jnp.zeros_like(condition), jnp.zeros_like(mask)
     return discriminator_of(config).bind({"params": params})(*map(jnp.asarray, (image, condition, mask)))
@@ -157,7 +157,7 @@ def discriminator_loss(config: TrainConfig, params: dict, fake: AnyArray, batch:
 
 
 def flatten_views(x: AnyArray) -> AnyArray:
-    """(objects, views, ...) as (objects * views, ...)."""
+    """Merges the first two axes: (objects, views, ...) to (objects * views, ...)."""
     return x.reshape(-1, *x.shape[2:])
 
 
@@ -177,7 +177,7 @@ def discriminator_step(
 def total_loss(
     config: TrainConfig, params: dict, stats: dict, judge: Judge | None, batch: Any, key: Key, step: Array
 ) -> tuple[Float[Array, ""], tuple[dict[str, Array], dict, Judge | None]]:
-    """(loss, (metrics, statistics, judge)): the loss of the method, and that of a discriminator after its step."""
+    """(loss, (metrics, statistics, judge)): the method's loss, plus that of the discriminator after its step."""
     variables = {"params": params, "batch_stats": stats}
     value, outcome = method_of(config.model).loss(variables, batch, key, config=config)
     metrics = outcome.metrics
@@ -194,7 +194,7 @@ def total_loss(
 def train_step(
     state: TrainState, batch: Any, *, config: TrainConfig, adversarial: bool = False
 ) -> tuple[TrainState, dict[str, Array]]:
-    """State after one step of the network, and of the discriminator from the same forward; and scalar metrics."""
+    """State after one step of the network, and of the discriminator on the same forward pass; and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
     judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
     gradient_of = jax.value_and_grad(partial(total_loss, config), has_aux=True)
@@ -224,17 +224,17 @@ def train_step(
 
 
 def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:
-    """The average with the newest weights in it, over a growing share of the past: early ones are far from the last."""
+    """Moving average after a step.  Its memory grows from 0, because early weights are far from the last."""
     share = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
 
 def averaged_variables(state: TrainState) -> dict:
-    """The generator that evaluation uses, as Linen variables."""
+    """The averaged weights of the generator that evaluation uses, as Linen variables."""
     return {"params": state.averaged, "batch_stats": state.averaged_stats}
 
 
-# runs once: a quick compilation, 2.7 s of CPU time instead of 7.0 for `tiny`, is worth more than quick code
+# runs once: compiling fast (2.7 s of CPU time instead of 7.0 for `tiny`) matters more than running fast
 ONCE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 jitted_create_state = jax.jit(create_state, static_argnames="config", compiler_options=ONCE)
 jitted_train_step = jax.jit(train_step, static_argnames=("config", "adversarial"), donate_argnames="state")

@@ -51,10 +51,10 @@ def train(
     init: Trained | None = None,
     light: Light | None = None,
 ) -> optimisation.TrainState:
-    """The state after the config's last step; goes on where an earlier call left the run folder.
+    """The state after the config's last step; continues a run folder from its newest checkpoint.
 
-    A new run begins with random weights, or those of `init`.  `mesh` divides batches among devices.  `light` is
-    that of the data set's pictures, where it is not the room.
+    A new run starts from random weights, or from `init`.  `mesh` divides batches among devices.  `light` is that of the
+    data set's pictures, if it is not the room.
     """
     runtime.few_arenas()
     programs.check_divides(mesh, config.batch_objects)
@@ -86,7 +86,7 @@ def train(
                 log.write({"step": done, **scores}, picture)
             if last:
                 write_network(run, config, state)
-            if save:  # after the rows up to this step, which a run that goes on from here will not write again
+            if save:  # after the rows up to this step: a continued run does not write them again
                 with log.paused():
                     checkpoint.save(run, state)
             if stopping and not last:
@@ -97,14 +97,14 @@ def train(
 def take_step(
     state: optimisation.TrainState, batch: Any, config: TrainConfig, mesh: Mesh | None, *, adversarial: bool
 ) -> tuple[optimisation.TrainState, dict]:
-    """The state after a batch whose objects the devices share, and metrics."""
+    """The state after a batch that is divided among the devices, and metrics."""
     with programs.using(mesh):
         batch = programs.place_batch(batch, mesh)
         return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
-    """The state to go on with, and a line about it: of the newest checkpoint, or before the first step."""
+    """The state to continue from (the newest checkpoint, or before the first step), and a message about it."""
     with programs.using(mesh):
         sharding = None if mesh is None else programs.sharding_of_all(mesh)
         state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
@@ -122,7 +122,7 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
 
 
 def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:
-    """The averaged weights as RUN/weights.npz; a line where float16 does not hold them."""
+    """Writes the averaged weights to RUN/weights.npz, and a message if they overflow float16."""
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     try:
         write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
@@ -131,7 +131,7 @@ def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState
 
 
 def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
-    """The rows; NotFinite for the first that holds a number that is not finite."""
+    """The rows; NotFinite for the first one with a value that is not finite."""
     for step, metrics in rows:
         for name, value in metrics.items():
             if not math.isfinite(value):
@@ -143,9 +143,9 @@ def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
 
 
 def check_state(state: optimisation.TrainState) -> None:
-    """NotFinite for the first array with a number that is not finite: such a state is not saved.
+    """NotFinite for the first array with a value that is not finite: such a state is not saved.
 
-    A running variance can overflow while every loss is finite, because batches are normalised with their own.
+    A running variance can overflow while every loss is finite, because each batch is normalised with its own variance.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not (finite := np.isfinite(leaf)).all():
@@ -155,7 +155,7 @@ def check_state(state: optimisation.TrainState) -> None:
 
 @contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """A list that fills when Ctrl-C or SIGTERM arrives: the loop ends its step, saves and stops."""
+    """A list that is filled on Ctrl-C or SIGTERM: the loop then finishes its step, saves and stops."""
     requests: list[int] = []
     previous = {s: signal.signal(s, lambda number, _: requests.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -173,7 +173,7 @@ def preview(
     light: Light | None = None,
     num_objects: int = 6,
 ) -> tuple[dict[str, float], np.ndarray]:
-    """Validation PSNR of the averaged network on a few objects, and references over renderings, kept in previews/."""
+    """Validation PSNR of the averaged network on a few objects, and the preview (references above renderings)."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
@@ -194,10 +194,10 @@ def preview(
 
 
 class MetricsLog:
-    """metrics.jsonl, TensorBoard and the bar of a run; rows after `first_step` of an earlier run are dropped."""
+    """metrics.jsonl, TensorBoard and progress bar of a run; rows after `first_step` from an earlier run are dropped."""
 
     def __init__(self, run: Path, first_step: int, num_steps: int) -> None:
-        """Opens them for appending."""
+        """Opens the files for appending."""
         from tensorboardX import SummaryWriter
 
         path = run / "metrics.jsonl"
@@ -210,7 +210,7 @@ class MetricsLog:
         self._pending: list[tuple[int, dict]] = []
 
     def step(self, done: int, metrics: dict) -> None:
-        """Keeps a step's metrics for the next row; the first step is waited for and not timed, because it compiles."""
+        """Keeps a step's metrics for the next row; waits for the first step and does not time it: it compiles."""
         self._pending.append((done, metrics))
         self._bar.update()
         if done == self._compiled:
@@ -218,9 +218,9 @@ class MetricsLog:
             self._since = time.monotonic()
 
     def mean(self) -> dict[str, int | float]:
-        """The row of the steps since the last one: the mean of those that have a metric; NotFinite for one that is not.
+        """The row for the steps since the last one: means over the steps that have a metric; NotFinite if not finite.
 
-        The discriminator's metrics begin somewhere between two rows.
+        The discriminator's metrics may start between two rows.
         """
         rows, self._pending = check_finite(jax.device_get(self._pending)), []
         done, newest = rows[-1]
@@ -234,16 +234,16 @@ class MetricsLog:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """What is done meanwhile is no step's time."""
+        """Time spent inside does not count as step time."""
         begin = time.monotonic()
         yield
         self._since += time.monotonic() - begin
 
     def write(self, row: dict[str, int | float], picture: np.ndarray | None = None) -> None:
-        """Appends one row, to the disk itself; in TensorBoard its entries are scalars, and the picture is an image."""
+        """Appends a row and flushes it to disk; TensorBoard gets its entries as scalars and the picture."""
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()
-        os.fsync(self._file.fileno())  # a checkpoint that outlives a power cut needs the rows before it
+        os.fsync(self._file.fileno())  # flushed to disk: after a power cut, no checkpoint may be newer than the rows
         for name, value in row.items():
             if name != "step":
                 self._board.add_scalar(name, value, row["step"])
@@ -251,14 +251,14 @@ class MetricsLog:
             self._board.add_image("preview", to_uint8(picture), row["step"], dataformats="HWC")
 
     def close(self) -> None:
-        """Closes them."""
+        """Closes the files."""
         self._bar.close()
         self._file.close()
         self._board.close()
 
 
 def read_rows(run: Path) -> list[dict]:
-    """Rows of a run's metrics.jsonl; a last line that a crash cut off is left out, and what follows a broken one."""
+    """Rows of a run's metrics.jsonl up to the first broken line (after a crash)."""
     path = run / "metrics.jsonl"
     rows: list[dict] = []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
@@ -273,6 +273,6 @@ def read_rows(run: Path) -> list[dict]:
 
 
 def checksum(dataset: data_sets.Dataset) -> str:
-    """A number that tells data sets apart: of their settings and the names of their objects."""
+    """A checksum of a data set's settings and object names."""
     content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
