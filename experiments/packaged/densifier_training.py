@@ -31,7 +31,7 @@ from spnr_jax.formats.surface_points import normalise, sample_surface
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.densifier import CHILDREN, Nodes, Places, blend, init, predict, see, turn
+from spnr_jax.method.densifier import CHILDREN, Nodes, Places, blend, build_graph, init, predict, turn
 from spnr_jax.surfels import geometry, sides
 from spnr_jax.surfels.geometry import Points, order_in_space
 
@@ -135,10 +135,10 @@ def count_sides(position: Array, normal: Array, spacing: Array) -> tuple[Array, 
     """How many directions see each point from before and from behind."""
     mask = jnp.ones(position.shape[1], bool)
     points = Points(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
-    return sides.count_facing(normal, geometry.look(points, normal, spacing))
+    return sides.count_facing(normal, geometry.estimate_visibility(points, normal, spacing))
 
 
-_see = jax.jit(see, compiler_options=QUICKEST)
+_see = jax.jit(build_graph, compiler_options=QUICKEST)
 
 
 def make_cloud(

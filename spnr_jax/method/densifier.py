@@ -83,7 +83,7 @@ class Children(NamedTuple):
     shares: Float[Array, "m 16"]
 
 
-def see(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Places]:
+def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Places]:
     """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
     nodes = describe(estimate_surfels(cloud, neighbors))
     return nodes, place(nodes, neighbors)
@@ -217,7 +217,7 @@ class Proposal(nn.Module):
     def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], places: Places) -> Children:
         """Residuals on the middles of the candidates; without training, the middles themselves."""
         real = places.around >= 0
-        seen, offset = look(nodes, places)
+        seen, offset = describe_points(nodes, places)
         told = compare_ends(nodes, places)
         element = nn.Dense(WIDTH, name="element")(seen) + nn.Dense(WIDTH, name="told")(told)[:, None]
         element += nn.Dense(WIDTH, use_bias=False, name="neighbor")(hidden)[places.around]
@@ -303,7 +303,7 @@ def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
     return clamp(jnp.stack([*parts, unlike, jnp.exp(-8 * unlike)], axis=-1), -8, 8)
 
 
-def look(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
+def describe_points(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
     """Features of the points around each candidate, and their offsets in its frame and scale."""
     number, scale = places.around, places.scale[:, None]
     way = (nodes.position[number] - places.middle[:, None]) / scale[..., None]
@@ -394,7 +394,7 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
 def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
     """`densify` of a cloud in the box."""
     neighbors = jnp.asarray(neighbors)
-    nodes, places = see(cloud, neighbors)
+    nodes, places = build_graph(cloud, neighbors)
     children = predict(params, nodes, neighbors, places)
 
     def extend(column: AnyArray, more: Array | None = None) -> Array:

@@ -89,7 +89,7 @@ def render(
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
     shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
-    asked = [look_at(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
+    asked = [prepare_view(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
     common = {
         of.resolution: surfel_renderer.largest(x.needed for x in asked if x.resolution == of.resolution) for of in asked
     }
@@ -104,7 +104,7 @@ def render(
         yield from two_at_a_time(lambda both: one(*both), zip(asked, views, strict=True))
 
 
-def look_at(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
+def prepare_view(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
     """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
     if share != 1:
         camera = cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))

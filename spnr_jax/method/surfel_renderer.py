@@ -243,7 +243,7 @@ def shade_window(
     """The second half: the network over the G-buffer."""
     inside = cameras.in_box(camera, scene.centre, scene.scale)
     window = crop_camera(scale_camera(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
-    drawn = shade(params, *look(blended.buffer, light, window), doublings=plan.doublings)
+    drawn = shade(params, *prepare_inputs(blended.buffer, light, window), doublings=plan.doublings)
     image, depth, acc = paste(drawn, blended.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=blended.overflow)
 
@@ -258,7 +258,7 @@ def rasterize(
     return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
 
 
-def look(
+def prepare_inputs(
     buffer: GBuffer, light: Light, camera: Camera
 ) -> tuple[
     Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]

@@ -125,7 +125,7 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
         color=columns(cloud.base_color),
     )
     raw, layer = find_layers(points, normals, sided=True, sheets=normals is None, rules=rules)
-    seen = look(points, layer.normal, raw, rules)
+    seen = estimate_visibility(points, layer.normal, raw, rules)
     normal, sided = find_sides(points, raw, layer, seen, rules)
     fields = describe(points, raw, layer, normal, sided, seen, rules)
     known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
@@ -247,7 +247,7 @@ def find_layers(
     return raw, layer
 
 
-def look(
+def estimate_visibility(
     points: Points, normal: Float[Array, "3 points"], spacing: Float[Array, " points"], rules: Rules = RULES
 ) -> Float[Array, "64 points"]:
     """Visibility of each point from each of 64 directions."""

@@ -64,7 +64,7 @@ def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 HEIGHT, WIDTH = 32, 64  # of a table
 ROOM = "room_light.npz"
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # roughnesses
-TOLD = 2  # index in LEVELS: this blurred table is sampled at the 64 visibility directions
+BLUR_LEVEL = 2  # index in LEVELS: this blurred table is sampled at the 64 visibility directions
 SPECULAR = 0.04  # reflectance of dielectrics at normal incidence
 LOBE = 8.0  # sharpness of the lobe of visibility directions around the mirrored one
 POLE = 1e-6  # sine of the angle to the poles of a map below which a direction has no azimuth
@@ -165,7 +165,7 @@ def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
 def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
     """Irradiance / pi of each surfel from the directions that it is visible from."""
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
-    tables = jnp.asarray(light.tables)[1 + TOLD].reshape(-1, 3)
+    tables = jnp.asarray(light.tables)[1 + BLUR_LEVEL].reshape(-1, 3)
     radiance = jnp.stack(look_up(tables, [jnp.asarray(x) for x in DIRECTIONS.T]), axis=-1)
     return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visible * cosines, radiance, precision="highest")
 

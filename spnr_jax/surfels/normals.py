@@ -190,5 +190,5 @@ def outward_normals(
 def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """The given normals turned outward; those of two-sided sheets are kept."""
     raw, layer = geometry.find_layers(points, normals, sided=False, sheets=True)
-    seen = geometry.look(points, layer.normal, raw)
+    seen = geometry.estimate_visibility(points, layer.normal, raw)
     return geometry.find_sides(points, raw, layer, seen)[0]

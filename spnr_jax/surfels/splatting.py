@@ -231,7 +231,7 @@ NEAR = 8  # entries before and after an entry in the list that are compared in d
 THIN = 0.03  # optical depth of a layer below which its mean transmittance is a series
 LEAST_SHARE = 1e-4  # least summed share that means are divided by
 SHARP = 4  # power of the kernel for the narrower weights that colours are blended with
-TOLD = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
+LEAST_WEIGHT = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
 FAR = 1e-4  # summed narrow weights below which the distances of the centres fade to 0
 
 
@@ -263,7 +263,7 @@ def blend(
     squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: squares would lose all digits
     sums += [x[:, None] for x in (drawn, jnp.sum(weight * left, axis=0), mean, squared)]
     total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
-    ahead = deep / jnp.where(total > TOLD, total, 1)
+    ahead = deep / jnp.where(total > LEAST_WEIGHT, total, 1)
     sums += [_sum_colors(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
     slot = jnp.arange(slots, dtype=jnp.int32)
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
@@ -428,8 +428,8 @@ def _gather(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     inverse = 1 / larger(share, LEAST_SHARE)
     *wide, log_spacing = (x * inverse for x in wide)
     *color, column, row, sharp = narrow
-    told = sharp > TOLD
-    inverse_sharp = jnp.where(told, 1 / jnp.where(told, sharp, 1), 0)
+    has_color = sharp > LEAST_WEIGHT
+    inverse_sharp = jnp.where(has_color, 1 / jnp.where(has_color, sharp, 1), 0)
     middles = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
     beside = (column, middles[0]), (row, middles[1])
     return GBuffer(

@@ -221,7 +221,7 @@ def make_view(
         return None
     whole = drawn.height * drawn.width
     room, slots = _size(int(needed.entries), 2**16), min(_size(int(needed.slots), whole // 16), whole)
-    seen, maps, ambient = map(np.asarray, look_at(scene.surfels, drawn, light, room=room, slots=slots))
+    seen, maps, ambient = map(np.asarray, prepare_view(scene.surfels, drawn, light, room=room, slots=slots))
     target = average_squares(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
     inside = (seen[..., 0] > FAINT) | (shown > 0)
@@ -237,12 +237,12 @@ def make_view(
 
 
 @partial(jax.jit, static_argnames=("room", "slots"))
-def look_at(
+def prepare_view(
     surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
     """Network input for a whole view, light maps, and spherical harmonics of the light."""
     buffer, _ = surfel_renderer.rasterize(surfels, camera, light, room=room, slots=slots)
-    return surfel_renderer.look(buffer, light, camera)[:3]
+    return surfel_renderer.prepare_inputs(buffer, light, camera)[:3]
 
 
 def _size(count: int, least: int) -> int:

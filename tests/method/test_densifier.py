@@ -111,7 +111,7 @@ def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
 def test_blocks_are_the_whole_at_once(params, monkeypatch):
     points = ball()
     near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes, places = jax.jit(densifier.see)(points, near)
+    nodes, places = jax.jit(densifier.build_graph)(points, near)
     found = []
     for block in (SIZE * CHILDREN, 37):
         monkeypatch.setattr(densifier, "BLOCK", block)
