@@ -26,7 +26,6 @@ import numpy as np
 from jax import export
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from spnr_jax.devices.runtime import make_room
 from spnr_jax.errors import UserError
 
 # --- many devices -----------------------------------------------------------------------------------------------------
@@ -126,9 +125,7 @@ class Kept:
             return self.jitted(*args, **static)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(sorted(static.items()))
         if key not in self.programs:
-            if make_room():
-                for kept in Kept.all:
-                    kept.programs.clear()
+            make_room()
             self.programs[key] = self._program(tree, leaves, static, key)
         return self.programs[key](*leaves)
 
@@ -160,6 +157,23 @@ class Kept:
             unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             os.replace(unfinished, file)
         return trace
+
+
+MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+FULL = 0.5  # share of the maps, from which on programs are dropped
+
+
+def make_room() -> None:
+    """Drops JAX's compiled programs when the process has used half of the memory maps that Linux grants it.
+
+    XLA takes three maps for each kernel on a CPU, a thousand for a size of clouds; where none is left it crashes.  What
+    is needed again is compiled again, or read from the disk.
+    """
+    with contextlib.suppress(OSError):  # another system
+        if MAPS.read_bytes().count(b"\n") > FULL * int(MOST_MAPS.read_text()):
+            jax.clear_caches()
+            for kept in Kept.all:
+                kept.programs.clear()
 
 
 def _is_plain(leaf: Any) -> bool:

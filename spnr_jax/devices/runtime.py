@@ -206,25 +206,6 @@ def _ask(what: Callable[[ctypes.CDLL], int]) -> None:
         return  # another C library
 
 
-MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-FULL = 0.5  # share of the maps, from which on programs are dropped
-
-
-def make_room() -> bool:
-    """Drops JAX's compiled programs when the process has used half of the memory maps that Linux grants it; if it did.
-
-    XLA takes three maps for each kernel on a CPU, a thousand for a size of clouds; where none is left it crashes.  What
-    is needed again is compiled again, or read from the disk.
-    """
-    import jax
-
-    with suppress(OSError):  # another system
-        if MAPS.read_bytes().count(b"\n") > FULL * int(MOST_MAPS.read_text()):
-            jax.clear_caches()
-            return True
-    return False
-
-
 # --- programs on the disk ---------------------------------------------------------------------------------------------
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, UInt8
 from tqdm import tqdm
 
 from spnr_jax.config import SurfelConfig, TrainConfig
-from spnr_jax.devices import runtime
+from spnr_jax.devices import programs
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
@@ -133,7 +133,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         item = read_object(dataset, name) if None in found else None
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
-                runtime.make_room()
+                programs.make_room()
                 arrays = make(item, number, light, config, variables)
                 write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
