@@ -235,7 +235,7 @@ class SurfelConfig(NetworkConfig):
 
     image_resolution: int = 512
     """Pixels along each side of a picture, by default."""
-    widths: tuple[int, ...] = (24, 48, 96, 160)
+    widths: tuple[int, ...] = (24, 48, 96, 160, 256)
     """Features of the U-Net's levels, from the G-buffer's resolution downwards."""
     top: int = 24
     """Features of the blocks that double the resolution."""

@@ -45,7 +45,7 @@ FINEST = 0.8  # pixels between points below which it has twice the resolution an
 SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture is small, and its FINEST
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
-GRID = 8  # a window's corner is a multiple: the network's pooling grid is the same from every camera
+GRID = 16  # a window's corner is a multiple: the network's pooling grid is the same from every camera
 LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 
 
