@@ -33,7 +33,7 @@ from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.densifier import CHILDREN, Nodes, Places, blend, build_graph, init, predict, turn
 from spnr_jax.surfels import geometry, sides
-from spnr_jax.surfels.geometry import Points, order_in_space
+from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
@@ -134,8 +134,8 @@ def find_outside(
 def count_sides(position: Array, normal: Array, spacing: Array) -> tuple[Array, Array]:
     """How many directions see each point from before and from behind."""
     mask = jnp.ones(position.shape[1], bool)
-    points = Points(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
-    return sides.count_facing(normal, geometry.estimate_visibility(points, normal, spacing))
+    points = PointColumns(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
+    return sides.sum_visibility(normal, geometry.estimate_visibility(points, normal, spacing))
 
 
 _see = jax.jit(build_graph, compiler_options=QUICKEST)

@@ -29,11 +29,11 @@ class PointCloud:
     metallic: Float[AnyArray, "*batch points"]
     mask: Bool[AnyArray, "*batch points"]
     normals: Float[AnyArray, "*batch points 3"] | None = None
-    """Of unit length, of either sign; None where none are known: then they are estimated from these points."""
+    """Of unit length, of either sign; None: they are estimated from these points."""
     materials_known: Float[AnyArray, "*batch points"] | None = None
-    """1 where roughness and metallic are known, 0 where they stand for any; None where all are known."""
-    invented: Float[AnyArray, "*batch points"] | None = None
-    """0 where a point was measured, else 1 - p / 2 of the probability p that it lies on the surface; None: all were."""
+    """1 where roughness and metallic are known, else 0; None: known everywhere."""
+    learned: Float[AnyArray, "*batch points"] | None = None
+    """0 for a measured point; 1 - p / 2 for a learned one, where p is the probability that it lies on the surface."""
 
 
 @no_type_check
@@ -104,30 +104,30 @@ class Volume:
 class Surfels:
     """Surface elements of one object (`surfels/geometry.py`): discs with materials; zeros where `mask` is False.
 
-    `spacing` is the side of the square that a point represents, in units of the box.  `border` is a line in the disc's
-    plane: a unit vector across it and its distance from the point (0: none); `jump` is added to the colour beyond it.
-    `sided` is near 1 where one side is outside, 0 where both are.  `visible` is the visibility from each of 64
-    directions. `shape` is the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
-    point along `rim` (a unit vector in its plane), against it, along normal x rim and against that.  `guessed` is 1
-    where roughness and metallic are unknown, `invented` 0 for a measured point and above 0 for a learned one
-    (`method/densifier.py`).
+    `spacing` is the side of the square that a point represents, in units of the box.  `color_edge` is a line in the
+    disc's plane: a unit vector across it and its distance from the point; `color_jump` is added to the colour beyond it
+    (0: no edge).  `one_sided` is near 1 where one side is outside, 0 for a two-sided disc.  `visibility` is given from
+    each of 64 directions.  `shape_ratios` are the planarity and linearity of the neighbourhood.  `rim_distances` are
+    the distances, in spacings, at which the disc ends: along `rim_tangent` (a unit vector in its plane), against it,
+    along normal x rim_tangent and against that.  `materials_unknown` is 1 where roughness and metallic are unknown.
+    `learned` is 0 for a measured point and above 0 for a learned one (`method/densifier.py`).
     """
 
     position: Float[AnyArray, "*batch points 3"]
     normal: Float[AnyArray, "*batch points 3"]
     spacing: Float[AnyArray, "*batch points"]
     base_color: Float[AnyArray, "*batch points 3"]
-    border: Float[AnyArray, "*batch points 4"]
-    jump: Float[AnyArray, "*batch points 3"]
+    color_edge: Float[AnyArray, "*batch points 4"]
+    color_jump: Float[AnyArray, "*batch points 3"]
     roughness: Float[AnyArray, "*batch points"]
     metallic: Float[AnyArray, "*batch points"]
-    guessed: Float[AnyArray, "*batch points"]
-    invented: Float[AnyArray, "*batch points"]
-    sided: Float[AnyArray, "*batch points"]
-    visible: Float[AnyArray, "*batch points 64"]
-    shape: Float[AnyArray, "*batch points 2"]
-    rim: Float[AnyArray, "*batch points 3"]
-    reach: Float[AnyArray, "*batch points 4"]
+    materials_unknown: Float[AnyArray, "*batch points"]
+    learned: Float[AnyArray, "*batch points"]
+    one_sided: Float[AnyArray, "*batch points"]
+    visibility: Float[AnyArray, "*batch points 64"]
+    shape_ratios: Float[AnyArray, "*batch points 2"]
+    rim_tangent: Float[AnyArray, "*batch points 3"]
+    rim_distances: Float[AnyArray, "*batch points 4"]
     mask: Bool[AnyArray, "*batch points"]
 
 

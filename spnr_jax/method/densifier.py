@@ -24,7 +24,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, root
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
+from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 
 MOST_POINTS = 32768  # a cloud of more points gets no children
 SPARSE = 8192  # points: up to here children are added everywhere; in larger clouds, only at rims and on curved parts
@@ -94,8 +94,8 @@ def describe(surfels: Surfels) -> Nodes:
     position, normal, spacing, color = map(
         jnp.asarray, (surfels.position, surfels.normal, surfels.spacing, surfels.base_color)
     )
-    openness, shown = 2 * jnp.mean(surfels.visible, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
-    traits = jnp.concatenate([surfels.shape, jnp.stack([surfels.sided, openness, shown], axis=1)], axis=1)
+    openness, shown = 2 * jnp.mean(surfels.visibility, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
+    traits = jnp.concatenate([surfels.shape_ratios, jnp.stack([surfels.one_sided, openness, shown], axis=1)], axis=1)
     return Nodes(position, normal, spacing, root(color), traits)
 
 
@@ -381,11 +381,11 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
 
     Pure, of static size: jit, vmap over equally padded clouds, grad.  `params` are the model's, `neighbors` those of
     `spnr_jax.neighbors(cloud)`; find them anew for the result before `encode`.  All points of the result have normals:
-    given, estimated or predicted.  `invented` is 0 for measured points.  UserError for params without a densifier.
+    given, estimated or predicted.  `learned` is 0 for measured points.  UserError for params without a densifier.
     """
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
-    inside, centre, scale = move_into_box(cloud)
+    inside, centre, scale = normalise_cloud(cloud)
     dense = densify_in_box(params["densifier"], inside, neighbors)
     children = dense.positions[len(cloud.mask) :] / scale + centre[None]
     return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), children]))
@@ -410,5 +410,5 @@ def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "po
         mask=extend(cloud.mask, choose(nodes, neighbors, places, children)),
         normals=extend(nodes.normal, children.normal),
         materials_known=None if cloud.materials_known is None else extend(cloud.materials_known),
-        invented=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(children.odds) / 2),
+        learned=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(children.odds) / 2),
     )

@@ -25,7 +25,7 @@ from spnr_jax.method.surfel_renderer import Blended, Sizes
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
-from spnr_jax.surfels.layers import RULES
+from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.lighting import room_light
 
 BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
@@ -72,7 +72,7 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
     """A sparse cloud in the box (unbatched) with learned points added, if the variables include a densifier."""
     count = int(np.sum(cloud.mask))
-    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.invented is not None:
+    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     padded = cloud_arrays.pad(cloud_arrays.strip(cloud), cloud_arrays.bucket(count))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
@@ -124,7 +124,7 @@ def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Si
 
 @partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
-    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)
+    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), CONSTANTS)
 
 
 _densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)

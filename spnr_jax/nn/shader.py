@@ -50,16 +50,16 @@ def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "
     """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
-    openness = jnp.sum(surfels.visible * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
-    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
+    openness = jnp.sum(surfels.visibility * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
+    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visibility, DIRECTIONS, precision="highest")
     view = normalize(jnp.asarray(eye[None] - surfels.position))
     along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
-    reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
+    reflected = jnp.sum(surfels.visibility * lobe, axis=1) / jnp.sum(lobe, axis=1)
     parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
-    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
-    parts += [surfels.sided, surfels.guessed, surfels.invented, jnp.mean(surfels.base_color, axis=1) ** 2]
+    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape_ratios]
+    parts += [surfels.one_sided, surfels.materials_unknown, surfels.learned, jnp.mean(surfels.base_color, axis=1) ** 2]
     return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
 
 
@@ -69,7 +69,7 @@ def features(
     """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
     (roughness, metallic, *arriving, reflected, openness), of_surface = map(columns, (first, last))
-    planarity, linearity, sided, guessed, invented, squared = of_surface
+    planarity, linearity, one_sided, materials_unknown, learned, squared = of_surface
     told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
     color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
     normal, view = _directions(buffer, camera)
@@ -81,14 +81,14 @@ def features(
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
     numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
     numbers += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
-    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
+    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, one_sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
     pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
     seen = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
     covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
     contrast = root(squared - jnp.mean(blended, axis=-1) ** 2)  # of the colours that are blended: a texture
-    pattern += [guessed[..., None], invented[..., None], contrast[..., None]]
+    pattern += [materials_unknown[..., None], learned[..., None], contrast[..., None]]
     seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
     unshadowed = lighting.irradiance(light, turned[0]), lighting.reflect(light, turned[1], roughness)
     maps = [*columns(color), metallic, covered, factor, summand, *arriving]

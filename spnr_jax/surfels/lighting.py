@@ -167,7 +167,7 @@ def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     tables = jnp.asarray(light.tables)[1 + BLUR_LEVEL].reshape(-1, 3)
     radiance = jnp.stack(look_up(tables, [jnp.asarray(x) for x in DIRECTIONS.T]), axis=-1)
-    return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visible * cosines, radiance, precision="highest")
+    return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visibility * cosines, radiance, precision="highest")
 
 
 def harmonics(x: Array, y: Array, z: Array) -> list[Array]:

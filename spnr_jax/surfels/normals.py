@@ -16,7 +16,7 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import geometry
-from spnr_jax.surfels.geometry import Points, order_in_space
+from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
 NEIGHBOURS = 16  # of a point, for the spacing
 REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance
@@ -113,9 +113,9 @@ def find_visible(
     _, rows = np.unique(pixels, axis=1, return_inverse=True)
     first = np.full(len(before), np.inf)
     np.minimum.at(first, rows.ravel(), depth[before])
-    seen = np.zeros(len(positions), bool)
-    seen[before] = depth[before] < first[rows.ravel()] + behind * spacing
-    return seen
+    visibility = np.zeros(len(positions), bool)
+    visibility[before] = depth[before] < first[rows.ravel()] + behind * spacing
+    return visibility
 
 
 def spacing_of(positions: Float[np.ndarray, "points 3"]) -> float:
@@ -156,9 +156,9 @@ def outward_normals(
     kept: Int[np.ndarray, " points"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals of the points with these indices, outward by the votes of directions and walls (sides.py).
+    """Unit normals of the points with these indices, outward by the votes of directions and thin walls (sides.py).
 
-    Linear colors separate sheets that nearly touch; `noise` is that of `planes`.
+    Linear colors split surfaces that nearly touch; `noise` is that of `planes`.
     """
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
@@ -174,21 +174,21 @@ def outward_normals(
 
     color = np.asarray(base_color[voters], np.float32)
     normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
-    points = Points(
-        number=columns(near, -1),
+    points = PointColumns(
+        neighbors=columns(near, -1),
         mask=jnp.arange(size) < len(order),
-        given=jnp.zeros(size, bool),  # whether the given normal is oriented
+        oriented=jnp.zeros(size, bool),  # whether the given normal is oriented
         position=columns(places[order]),
         color=columns(color[order]),
     )
     found = np.empty_like(places)
-    found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
+    found[order] = np.asarray(_orient(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]
 
 
 @partial(jax.jit, compiler_options=QUICKEST)
-def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
-    """The given normals turned outward; those of two-sided sheets are kept."""
-    raw, layer = geometry.find_layers(points, normals, sided=False, sheets=True)
-    seen = geometry.estimate_visibility(points, layer.normal, raw)
-    return geometry.find_sides(points, raw, layer, seen)[0]
+def _orient(points: PointColumns, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
+    """The given normals turned outward; two-sided ones are kept."""
+    raw_spacing, layer = geometry.find_layers(points, normals, oriented=False, split_by_color=True)
+    visibility = geometry.estimate_visibility(points, layer.normal, raw_spacing)
+    return geometry.orient_layers(points, raw_spacing, layer, visibility)[0]

@@ -96,7 +96,7 @@ def footprints(surfels: Surfels, camera: Camera) -> Footprints:
     )
     normal = numerics.rotate_columns(rotation, surfels.normal)
     cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(root(x * x + y * y + z * z), NEAREST)
-    facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
+    facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
     ahead = larger(-z, NEAREST)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
@@ -174,9 +174,9 @@ def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, In
     point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=room)
     # gather whole columns once instead of at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
-    rim = numerics.rotate_columns(rotation, surfels.rim)
+    rim = numerics.rotate_columns(rotation, surfels.rim_tangent)
     side = _cross(foot.normal, rim)
-    reach = tuple(columns(jnp.asarray(surfels.reach)))
+    reach = tuple(columns(jnp.asarray(surfels.rim_distances)))
     foot, begin, point, rim, side, reach = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, reach))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
@@ -288,8 +288,8 @@ def _sum_rows(
 
 def _colors(surfels: Surfels) -> Float[Array, "points 10"]:
     """For each disc: its colour, the line of its border, and the jump of colour across it."""
-    border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
-    parts = surfels.base_color, surfels.border[:, :3], border[:, None], surfels.jump
+    border = surfels.color_edge[:, 3] + jnp.sum(surfels.color_edge[:, :3] * surfels.position, axis=-1)
+    parts = surfels.base_color, surfels.color_edge[:, :3], border[:, None], surfels.color_jump
     return jnp.concatenate(parts, axis=1)
 
 

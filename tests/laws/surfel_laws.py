@@ -20,7 +20,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_MAPS
 from spnr_jax.surfels import discs, layers, lighting, splatting
-from spnr_jax.surfels.layers import NEIGHBORS, RULES
+from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS
 
 POINTS = 16
 
@@ -131,7 +131,7 @@ def sheets(rng, size=1.0):
 
 
 def hood_of(offset):
-    return layers.Hood(jnp.ones_like(offset[:, 0]), offset, jnp.sum(offset**2, axis=1), offset[:, :0])
+    return layers.Neighborhood(jnp.ones_like(offset[:, 0]), offset, jnp.sum(offset**2, axis=1), offset[:, :0])
 
 
 def covariance(offset, spacing):
@@ -144,12 +144,12 @@ def covariance_twin(offset, spacing):
 
 def spacings(offset):
     """From the discs that hold some of the neighbours, whatever their layer."""
-    return discs.first_spacing(hood_of(offset), RULES)
+    return discs.measure_raw_spacing(hood_of(offset), CONSTANTS)
 
 
 def spacings_twin(offset):
     distance = np.sort(np.linalg.norm(offset, axis=1), axis=0)
-    return np.sqrt(np.pi / RULES.first_disc) * distance[RULES.first_disc]
+    return np.sqrt(np.pi / CONSTANTS.raw_neighbors) * distance[CONSTANTS.raw_neighbors]
 
 
 def sorted_sheets(rng, size):
@@ -164,7 +164,9 @@ def quadric(offset, spacing):
     up = jnp.stack([jnp.zeros_like(spacing), jnp.zeros_like(spacing), jnp.ones_like(spacing)])
     weight = jnp.exp(-0.2 * jnp.sum((offset / spacing[None, None]) ** 2, axis=1))
     free = jnp.zeros(spacing.shape, bool)
-    layer, _ = layers.fit_layers(hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(RULES, rounds=1))
+    layer, _ = layers.fit_layers(
+        hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(CONSTANTS, fit_rounds=1)
+    )
     return layer.normal, layer.height
 
 
@@ -173,7 +175,7 @@ def places(rng, size):
 
 
 def farthest_twin(place):
-    return np.stack([(place[:, 0] * np.cos(t) + place[:, 1] * np.sin(t)).max(axis=0) for t in discs.TURN])
+    return np.stack([(place[:, 0] * np.cos(t) + place[:, 1] * np.sin(t)).max(axis=0) for t in discs.RIM_ANGLES])
 
 
 def borders(place, colors):
@@ -181,7 +183,7 @@ def borders(place, colors):
     place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES).values())
+    return tuple(discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors, CONSTANTS).values())
 
 
 def parted(rng, size):
@@ -272,7 +274,7 @@ def arrives(light, visible, normal):
     """Irradiance, as `lighting.arriving` has it of surfels."""
     count = visible.shape[-1]
     found = surfels(np.zeros((count, 3)), (0.0, 0.0, 1.0), 0.1)
-    return lighting.arriving(dataclasses.replace(found, visible=visible.T, normal=normal.T), Light(tables=light)).T
+    return lighting.arriving(dataclasses.replace(found, visibility=visible.T, normal=normal.T), Light(tables=light)).T
 
 
 def shade(outputs, maps, ambient):

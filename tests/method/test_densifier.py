@@ -38,7 +38,7 @@ def ball(seed=0):
 
 def kept(dense):
     """What is kept of a dense cloud, sorted by place, so that orders can be compared."""
-    columns = [dense.positions, dense.normals, dense.base_color, dense.invented[:, None]]
+    columns = [dense.positions, dense.normals, dense.base_color, dense.learned[:, None]]
     rows = np.concatenate([np.asarray(x) for x in columns], axis=1)[np.asarray(dense.mask)]
     return rows[np.lexsort(np.round(rows[:, :3], 3).T)]
 
@@ -49,11 +49,11 @@ def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
     assert dense.mask.shape == (SIZE * (1 + CHILDREN),)
     for name in ("positions", "base_color", "roughness", "metallic", "mask"):
         np.testing.assert_array_equal(getattr(dense, name)[:SIZE], getattr(points, name))
-    invented = np.asarray(dense.invented)[np.asarray(dense.mask)]
-    np.testing.assert_array_equal(invented[:COUNT], 0)
-    assert (invented[COUNT:] >= 0.5).all()
-    assert (invented <= 1).all()
-    assert COUNT < len(invented) - COUNT < 4 * COUNT
+    learned = np.asarray(dense.learned)[np.asarray(dense.mask)]
+    np.testing.assert_array_equal(learned[:COUNT], 0)
+    assert (learned[COUNT:] >= 0.5).all()
+    assert (learned <= 1).all()
+    assert COUNT < len(learned) - COUNT < 4 * COUNT
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
 
 
@@ -200,4 +200,4 @@ def test_the_handle_densifies_sparse_clouds_alone(params, monkeypatch):
 def test_the_handle_encodes_the_points_alone_where_it_is_asked_to():
     surfels = spnr_jax.load().encode(cloud(shape("sphere", 300)[0]), densify=False).scene.surfels
     assert int(np.sum(surfels.mask)) == 300
-    np.testing.assert_array_equal(surfels.invented, 0)
+    np.testing.assert_array_equal(surfels.learned, 0)

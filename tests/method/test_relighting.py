@@ -65,7 +65,7 @@ def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(mo
 
     def drawn(volume, light, azimuth):
         if not shadowed:
-            surfels = volume.scene.surfels.replace(visible=jnp.ones_like(volume.scene.surfels.visible))
+            surfels = volume.scene.surfels.replace(visibility=jnp.ones_like(volume.scene.surfels.visibility))
             volume = volume.replace(scene=volume.scene.replace(surfels=surfels))
         return linear(model, volume, light, azimuth)
 

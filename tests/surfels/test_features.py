@@ -46,7 +46,7 @@ def test_the_network_sees_no_light():
     close(one, other)
 
 
-@pytest.mark.parametrize(("name", "column"), [("guessed", 30), ("invented", 31)])
+@pytest.mark.parametrize(("name", "column"), [("materials_unknown", 30), ("learned", 31)])
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_one_number_says_whether_materials_are_guessed_and_one_whether_points_are_and_no_other_does(
     name, column, share

@@ -57,7 +57,7 @@ def test_roughness_passes_through_the_levels_without_jumps():
 
 def test_everything_is_linear_in_the_map():
     one, other = envmap(1), envmap(2)
-    found = surfels(numbers(0, 30, 3), jnp.asarray(DIRECTIONS[:30]), 0.1, visible=numbers(1, 30, 64, low=0.0))
+    found = surfels(numbers(0, 30, 3), jnp.asarray(DIRECTIONS[:30]), 0.1, visibility=numbers(1, 30, 64, low=0.0))
     towards, roughness = columns(DIRECTIONS), numbers(2, 64, low=0.0)
     turn = np.float32([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])
 
@@ -121,7 +121,7 @@ def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradian
     found = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1)
     open_light = np.stack(irradiance(light, columns(DIRECTIONS)), axis=-1)
     close(arriving(found, light), open_light, rtol=0.08, atol=0.05)
-    blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visible=np.zeros((64, 64)))
+    blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visibility=np.zeros((64, 64)))
     assert np.all(np.asarray(arriving(blind, light)) == 0)
 
 

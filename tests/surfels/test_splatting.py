@@ -81,7 +81,7 @@ class TestEntries:
     def test_they_are_all_pairs_of_a_float64_loop_over_discs_and_pixels_also_for_a_wide_view(self):
         position, normal, _ = shape("sphere", 40, "random")
         reach = np.random.default_rng(6).uniform(0.2, 2, (40, 4))
-        found = surfels(position, normal, 0.25, reach=reach)
+        found = surfels(position, normal, 0.25, rim_distances=reach)
         view = camera(20, (0.9, 0.8, 0.9), field_of_view=1.9)
         _, entries = draw(found, view)
         table = np.zeros((40, 400))
@@ -96,7 +96,7 @@ class TestEntries:
         for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
             slope = directions @ n
             hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
-            rim = np.float64(found.rim[i])
+            rim = np.float64(found.rim_tangent[i])
             side = np.cross(n, rim)
             ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
             kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
@@ -143,14 +143,14 @@ class TestEntries:
 class TestBlend:
     @settings(hypotheses, max_examples=12)
     @given(st.integers(0, 999), st.floats(-2, -0.6), st.floats(0, 1), st.floats(1, 4))
-    def test_every_pixel_is_that_of_a_float64_loop_over_its_list(self, seed, size, sided, away):
+    def test_every_pixel_is_that_of_a_float64_loop_over_its_list(self, seed, size, one_sided, away):
         rng = np.random.default_rng(seed)
         normal = rng.normal(size=(500, 3))
         found = surfels(
             *(rng.uniform(-0.6, 0.6, (500, 3)), normal / np.linalg.norm(normal, axis=1, keepdims=True)),
             0.3 * 10.0**size * rng.uniform(0.5, 1, 500),
             base_color=rng.uniform(size=(500, 3)),
-            sided=sided * rng.uniform(size=500),
+            one_sided=one_sided * rng.uniform(size=500),
         )
         view = camera(24, (0.0, 0.6 * away, 0.8 * away))
         entries, lost = make_entries(found, view, room=TOTAL)
@@ -171,7 +171,8 @@ class TestBlend:
         color = np.where(ahead[:, None], 0.5, 0.5 + jump)
         jumps = np.where(ahead[:, None], jump, -jump)
         buffer, _ = draw(
-            surfels(found.position, (0, 0, 1.0), found.spacing, base_color=color, border=border, jump=jumps), view
+            surfels(found.position, (0, 0, 1.0), found.spacing, base_color=color, color_edge=border, color_jump=jumps),
+            view,
         )
         rays = np.asarray(cameras.camera_rays(view).directions)
         hit = [0, 0, 2.5] - 2.5 * rays / rays[..., 2:]
@@ -201,7 +202,11 @@ class TestBlend:
         normal = np.concatenate([normal, clutter / np.linalg.norm(clutter, axis=1, keepdims=True)])
         color = rng.uniform(size=(500, 3))
         found = surfels(
-            np.concatenate([position, clutter]), normal, spacing, base_color=color, sided=rng.uniform(size=500) < 0.7
+            np.concatenate([position, clutter]),
+            normal,
+            spacing,
+            base_color=color,
+            one_sided=rng.uniform(size=500) < 0.7,
         )
         one, other = (draw(found, camera(24, (0.3 + step, 0.2, 2.4)))[0] for step in (0.0, 1e-6))
         assert np.abs(one.opacity - other.opacity).max() < 2e-4

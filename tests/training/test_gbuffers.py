@@ -169,13 +169,14 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
     for sign in (np.ones(3, np.float32), mirror):
-        columns = {"base_color": color, "jump": color[:, ::-1] - color, "roughness": color[:, 0], "shape": color[:, :2]}
-        columns |= {"metallic": color[:, 1], "guessed": color[:, 2], "invented": color[:, 0], "rim": rim * sign}
+        columns = {"base_color": color, "color_jump": color[:, ::-1] - color, "shape_ratios": color[:, :2]}
+        columns |= {"roughness": color[:, 0], "metallic": color[:, 1], "materials_unknown": color[:, 2]}
+        columns |= {"learned": color[:, 0], "rim_tangent": rim * sign}
         surfels = surfel_clouds.surfels(
             0.8 * normal * sign, normal * sign, 0.4, **columns,
-            border=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
-            visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
-            reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
+            color_edge=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
+            visibility=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
+            rim_distances=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
         )  # fmt: skip
         seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
