@@ -188,21 +188,21 @@ class GBuffer:
     """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes.
 
     `opacity` is that of all surfels along the ray, `coverage` the summed weights of the front-most.  `depth` is along
-    the camera's axis, `spread` its standard deviation.  `color` is blended with the narrower weights, the rest with the
-    wider ones.  `centres` sums the narrower weights; `beside` is the mean offset of the discs' centres from the
-    pixel's, in pixels.  All fields are 0 at pixels without discs.
+    the camera's axis, `depth_deviation` its standard deviation.  `color` is blended with narrower weights than the
+    rest; `sharp_weight` is their sum, and `centre_offset` the mean offset of the discs' centres from the pixel's, in
+    pixels.  All fields are 0 at pixels without discs.
     """
 
     opacity: Float[Array, "height width"]
     coverage: Float[Array, "height width"]
     depth: Float[Array, "height width"]
-    spread: Float[Array, "height width"]
+    depth_deviation: Float[Array, "height width"]
     log_spacing: Float[Array, "height width"]
     normal: Float[Array, "height width 3"]
     color: Float[Array, "height width 3"]
     attributes: Float[Array, "height width features"]
-    centres: Float[Array, "height width"]
-    beside: Float[Array, "height width 2"]
+    sharp_weight: Float[Array, "height width"]
+    centre_offset: Float[Array, "height width 2"]
 
 
 @no_type_check
@@ -223,11 +223,11 @@ class Batch:
 class Crops:
     """One training batch of the shader network: crops of G-buffers as network inputs (`nn/shader.py`).
 
-    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `seen` extends
+    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `inputs` extend
     `margin` pixels beyond it and beyond the light maps on each side.
     """
 
-    seen: Float[AnyArray, "crops rows columns 33"]
+    inputs: Float[AnyArray, "crops rows columns 33"]
     maps: Float[AnyArray, "crops height width 17"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]

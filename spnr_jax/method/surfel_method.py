@@ -21,7 +21,7 @@ from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Blended, Sizes
+from spnr_jax.method.surfel_renderer import Sizes, WindowBuffer
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
@@ -31,7 +31,7 @@ from spnr_jax.surfels.lighting import room_light
 BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
 
 
-class Asked(NamedTuple):
+class PlannedView(NamedTuple):
     """A view with its light, and its requirements: the camera that is drawn, doublings and side, sizes."""
 
     camera: Camera
@@ -88,38 +88,41 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
-    shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
-    asked = [prepare_view(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
+    shader, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
+    planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     common = {
-        of.resolution: surfel_renderer.largest(x.needed for x in asked if x.resolution == of.resolution) for of in asked
+        of.resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == of.resolution)
+        for of in planned
     }
 
-    def one(of: Asked, whole: Camera) -> Rendering:
+    def one(of: PlannedView, whole: Camera) -> Rendering:
         drawn = draw_planned(shader, volume, of, common[of.resolution])
-        return drawn if share == 1 else _enlarge(drawn, whole.height, whole.width)
+        return drawn if render_scale == 1 else _enlarge(drawn, whole.height, whole.width)
 
     if len(views) == 1:
-        yield one(asked[0], views[0])
+        yield one(planned[0], views[0])
     else:
-        yield from two_at_a_time(lambda both: one(*both), zip(asked, views, strict=True))
+        yield from two_at_a_time(lambda both: one(*both), zip(planned, views, strict=True))
 
 
-def prepare_view(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
+def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_scale: float) -> PlannedView:
     """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
-    if share != 1:
-        camera = cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
-    doublings, side = surfel_renderer.resolution(scene, camera, share)
+    if render_scale != 1:
+        camera = cameras.resize(
+            camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
+        )
+    doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
     needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
-    return Asked(camera, light or room_light(), (doublings, side), needed)
+    return PlannedView(camera, light or room_light(), (doublings, side), needed)
 
 
-def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Sizes) -> Rendering:
+def draw_planned(variables: dict | None, volume: Volume, planned: PlannedView, sizes: Sizes) -> Rendering:
     """A view drawn with arrays of these sizes."""
-    if not asked.needed.entries:
-        return _leave_empty(volume.scene, asked.camera)
-    plan = surfel_renderer.round_sizes(sizes, *asked.resolution)
-    blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
-    return _shade(variables, volume.scene, asked.camera, asked.light, blended, plan=plan)
+    if not planned.needed.entries:
+        return _leave_empty(volume.scene, planned.camera)
+    plan = surfel_renderer.round_sizes(sizes, *planned.resolution)
+    window_buffer = _rasterize(volume.scene, planned.camera, planned.light, plan=plan)
+    return _shade(variables, volume.scene, planned.camera, planned.light, window_buffer, plan=plan)
 
 
 @partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
@@ -128,7 +131,7 @@ def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScen
 
 
 _densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
-_blend = Kept(surfel_renderer.blend_window, static="plan", returns=(Blended, GBuffer))
+_rasterize = Kept(surfel_renderer.rasterize_window, static="plan", returns=(WindowBuffer, GBuffer))
 _shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
 _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
@@ -138,6 +141,6 @@ def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
     """An empty view: the object is not visible."""
     inside = cameras.in_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
-    image, depth, acc = surfel_renderer.paste(*nothing, inside, 1)
+    image, depth, acc = surfel_renderer.paste_window(*nothing, inside, 1)
     overflow = jnp.zeros((), jnp.int32)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=overflow)

@@ -382,8 +382,10 @@ def _test_split(
         squares - other_weight**2 / jnp.maximum(total_weight, 1e-9), 1e-9
     )  # if the step were the only unknown
     high = jnp.abs(step) / fit.layer.thickness
-    independence, significance = 1 / (step_alone * error), high * const.thickness_per_deviation / jnp.sqrt(error)
-    measured = high, independence, _smaller_weight(total_weight, other_weight), significance
+    independence = 1 / (step_alone * error)
+    smaller_weight = _smaller_weight(total_weight, other_weight)
+    significance = high * const.thickness_per_deviation / jnp.sqrt(error)
+    measured = high, independence, smaller_weight, significance
     limits = const.step_height, const.step_independence, const.step_points, const.step_significant
     passed = [[value > limit[i] for value, limit in zip(measured, limits, strict=True)] for i in (0, 1)]
     return jnp.all(jnp.stack(passed[0]), axis=0), jnp.all(jnp.stack(passed[1]), axis=0)

@@ -214,7 +214,7 @@ def lists(rng, tau=1.0, distance=2.0):
 
 
 def shares_twin(tau, depth, spacing):
-    return reference.shares(tau, depth, spacing, splatting.NEAR)
+    return reference.shares(tau, depth, spacing, splatting.COMPARED)
 
 
 @st.composite
@@ -242,9 +242,9 @@ def within_one(arguments, outputs):
 # fmt: off
 LISTS = (
     # thin lists are a series, to 7e-9: no twin
-    Law("shares", splatting.shares, None, (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0,
-        floors=(0.0, 1.0)),
-    Law("shares beside the loop", splatting.shares, shares_twin,
+    Law("blend weights", splatting.compute_blend_weights, None,
+        (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 1.0)),
+    Law("blend weights beside the loop", splatting.compute_blend_weights, shares_twin,
         (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 1.0),
         extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,
         atol=lambda tau, *x: 1e-6 * (1 + gap_rounding(tau, *x) * tau.max()), check=within_one)),
@@ -278,7 +278,7 @@ def arrives(light, visible, normal):
 
 
 def shade(outputs, maps, ambient):
-    return shader.picture(outputs, maps, ambient, 0)
+    return shader.compose_picture(outputs, maps, ambient, 0)
 
 
 def lit(rng, light):

@@ -23,16 +23,16 @@ def sky():
 
 @jax.jit
 def drawn(found, light, view):
-    found = shader.turn_to_camera(found, view)
-    entries, _ = splatting.entries(found, view, room=2**15)
-    buffer = splatting.blend(entries, found, shader.attributes(found, light, view), view, slots=24**2)
-    return buffer, *shader.features(buffer, light, view)
+    found = shader.face_camera(found, view)
+    entries, _ = splatting.make_entries(found, view, capacity=2**15)
+    buffer = splatting.blend(entries, found, shader.compute_attributes(found, light, view), view, slots=24**2)
+    return buffer, *shader.compute_inputs(buffer, light, view)
 
 
 def test_normals_of_discs_seen_from_behind_are_turned_to_the_camera_and_others_kept():
     positions, normal, spacing = shape("sphere", 500)
     found, view = surfels(positions, normal, spacing), camera(24)
-    turned = shader.turn_to_camera(found, view).normal
+    turned = shader.face_camera(found, view).normal
     towards = np.asarray(view.cam_to_world)[:, 3] - positions
     assert np.all(np.sum(towards * np.asarray(turned), axis=1) >= 0)
     close(turned, normal * np.where(np.sum(towards * normal, axis=1) < 0, -1, 1)[:, None])
@@ -94,7 +94,7 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
         centres=ones, beside=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
-    seen, _ = jax.jit(shader.features)(buffer, light_of(sky()), view)
+    seen, _ = jax.jit(shader.compute_inputs)(buffer, light_of(sky()), view)
     for column in (7, 8):
         assert seen[8, 8, column] > 0.3
         assert seen[24, 24, column] < -0.3

@@ -93,7 +93,7 @@ def test_batches_are_a_function_of_seed_and_step():
         assert a.doublings == b.doublings
         same_bits(a, b)
     other = gbuffers.make_batch(grouped(views), dataclasses.replace(CONFIG, seed=1), 0)
-    assert other.doublings != whole[0].doublings or not np.array_equal(other.seen, whole[0].seen)
+    assert other.doublings != whole[0].doublings or not np.array_equal(other.inputs, whole[0].inputs)
 
 
 def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeypatch):
@@ -150,7 +150,10 @@ def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is_and_is_its_
     whole = gbuffers.crop_square(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
     turned = gbuffers.mirror(whole, axis)
     losses = [
-        loss(params, Crops(**{name: x[None] for name, x in one.items()}, doublings=kept.doublings))[0]
+        loss(
+            params,
+            Crops(**{name.replace("seen", "inputs"): x[None] for name, x in one.items()}, doublings=kept.doublings),
+        )[0]
         for one in (whole, turned)
     ]
     np.testing.assert_allclose(*losses, rtol=1e-5)
@@ -178,7 +181,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             visibility=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
             rim_distances=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
         )  # fmt: skip
-        seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
+        seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, capacity=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)
     assert np.abs(seen[1][..., shader.ODD[axis]]).mean() > 0.1
