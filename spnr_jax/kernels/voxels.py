@@ -30,7 +30,7 @@ from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rays
 
-NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
+NEIGHBORS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ def scatter_conv(
     """
     products = jnp.einsum("pf,tfo->pto", values, kernel.reshape(27, *kernel.shape[3:]), precision="highest")
     # the output at voxel v reads voxel v + n through tap n: a point contributes to its neighbours at -n
-    steps = -jnp.array([NEIGHBOURS], jnp.int32)
+    steps = -jnp.array([NEIGHBORS], jnp.int32)
     cell = jnp.stack([rows // resolution**2, rows // resolution % resolution, rows % resolution], axis=-1)
     cell = cell[:, None] + steps
     valid = (rows < resolution**3)[:, None] & jnp.all((cell >= 0) & (cell < resolution), axis=-1)

@@ -93,12 +93,12 @@ def _conv2d(x, kernel, stride, padding):
 def _conv2d_jvp(stride, padding, primals, tangents):
     """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
     out = _conv2d(*primals, stride, padding)
-    changes = [
+    tangents_out = [
         jax.linear_transpose(lambda cotangent, of=of: of(*primals, cotangent, stride, padding), out)(tangent)[0]
         for of, tangent in zip((_input_gradient, _kernel_gradient), tangents, strict=True)
         if not isinstance(tangent, SymbolicZero)
     ]
-    return out, sum(changes[1:], changes[0])
+    return out, sum(tangents_out[1:], tangents_out[0])
 
 
 _conv2d.defjvp(_conv2d_jvp, symbolic_zeros=True)
@@ -114,8 +114,8 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
     window = kernel.shape[0]
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
-    turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
-    return _plain(cotangent, turned, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
+    flipped = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
+    return _plain(cotangent, flipped, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
@@ -126,8 +126,8 @@ def _kernel_gradient(x, kernel, cotangent, stride, padding):
     window = kernel.shape[0]
     if window != 3:
         flat = cotangent.reshape(-1, kernel.shape[-1])
-        seen = _windows(_pad(x, padding), window, stride)
-        return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen]).reshape(kernel.shape)
+        windows = _windows(_pad(x, padding), window, stride)
+        return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in windows]).reshape(kernel.shape)
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
     pads = [(padding, (m - 1) * stride + window - n - padding) for n, m in sizes]
     large = jnp.transpose(cotangent, (1, 2, 0, 3))

@@ -8,7 +8,7 @@ U-Net           each encoder stage (a stride-2 convolution and one at stride 1) 
 field           density and colour at a place from the volume's feature there: one hidden layer with softplus, density =
                 softplus(raw - 1) (a ReLU can die early in training); features depend on the view direction.  All
                 features but RGB are linear in the hidden layer, and so is compositing: the hidden layer is composited,
-                and `finish` applies the linear part once per ray instead of once per sample
+                and `decode` applies the linear part once per ray instead of once per sample
 upsampler       feature image to an image of twice the size; it learns what to add to the bilinear RGB
 discriminator   PatchGAN on image patches and the true colours at the visible input points
 """
@@ -182,7 +182,7 @@ class UNet3D(nn.Module):
 
 
 class RadianceField(nn.Module):
-    """Density and colour of samples; `view` and `finish` are the parts that a ray needs once."""
+    """Density and colour of samples; `view` and `decode` are the parts that a ray needs once."""
 
     width: int
     num_features: int
@@ -213,7 +213,7 @@ class RadianceField(nn.Module):
         rgb = nn.sigmoid(out[..., 1:] + view[..., None, :3])
         return softplus(out[..., 0] - 1), (rgb, hidden.reshape(*x.shape[:-1], self.width))
 
-    def finish(
+    def decode(
         self, emitted: tuple[Array, Array], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
     ) -> Float[Array, "*rays features"]:
         """Features of a ray, RGB on white and the rest on zero, from what is composited and its opacity."""

@@ -18,7 +18,7 @@ from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import geometry
 from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
-NEIGHBOURS = 16  # of a point, for the spacing
+NEIGHBORS = 16  # of a point, for the spacing
 REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance
 DISCS = 2.5  # times the points in a disc of that radius: number of neighbours
 MOST = 128  # neighbours at most
@@ -31,7 +31,7 @@ SAMPLE = 2048  # points at which the spacing is measured
 TINY = np.finfo(np.float64).tiny
 
 
-def planes(
+def estimate_normals(
     positions: Float[np.ndarray, "points 3"], among: Float[np.ndarray, "all 3"], noise: float = 0.0
 ) -> Float[np.ndarray, "points 3"]:
     """Unit normals, of either sign, at some points, from all points of their cloud (`among`).
@@ -40,12 +40,12 @@ def planes(
     previous plane, so that a point at an edge gets one of its faces (robust moving least squares, Fleishman et al.
     2005). `noise` is the standard deviation of the points before they were averaged: it enlarges the neighbourhood.
     """
-    return _planes(positions, cKDTree(among), noise)
+    return _estimate_normals(positions, cKDTree(among), noise)
 
 
-def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
-    """The normals of `planes`, from a k-d tree of all points."""
-    spacing = _spacing(tree)
+def _estimate_normals(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
+    """The normals of `estimate_normals`, from a k-d tree of all points."""
+    spacing = _measure_spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
     ranks = list(range(1, round(min(count, MOST, tree.n)) + 1))
@@ -55,37 +55,37 @@ def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
         offset = tree.data[near] - points[:, None]
         weight = close = np.exp(-0.5 * (distance / max(radius, TINY)) ** 2)
         for _ in range(ROUNDS):
-            height = np.einsum("nki,ni->nk", offset, _narrowest(offset, weight))
+            height = np.einsum("nki,ni->nk", offset, _find_narrowest(offset, weight))
             weight = close * np.exp(-0.5 * (height / max(thick, TINY)) ** 2)
-        return _narrowest(offset, weight)
+        return _find_narrowest(offset, weight)
 
     return np.concatenate([of_rows(positions[i : i + ROWS]) for i in range(0, len(positions), ROWS)])
 
 
-def _narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _find_narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Unit vectors (n, 3) of least variance of weighted neighbours (n, k, 3)."""
     share = weight / weight.sum(axis=1, keepdims=True)
     centred = offset - (share[:, None] @ offset)
     return np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
 
 
-def facing(
+def face_sensor(
     positions: Float[np.ndarray, "points 3"],
     among: Float[np.ndarray, "all 3"],
     place: Float[np.ndarray, "3"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """The normals of `planes`, turned to the position of the sensor that saw the points.
+    """The normals of `estimate_normals`, turned to the position of the sensor that saw the points.
 
     One sensor sees only one side of each surface, so all heights above the planes count as noise, depth steps included.
     """
     tree = cKDTree(among)
-    normals = _planes(positions, tree, max(noise, ROUGH * _thickness(tree)))
+    normals = _estimate_normals(positions, tree, max(noise, ROUGH * _measure_thickness(tree)))
     towards = np.einsum("ni,ni->n", normals, place - positions)
     return np.where(towards[:, None] < 0, -normals, normals)
 
 
-def _thickness(tree: cKDTree) -> float:
+def _measure_thickness(tree: cKDTree) -> float:
     """Median thickness of a sample of neighbourhoods about their least-squares planes."""
     sample = tree.data[:: -(-tree.n // SAMPLE)]
     near = tree.data[tree.query(sample, list(range(1, min(FLAT, tree.n) + 1)), workers=-1)[1]]
@@ -118,15 +118,15 @@ def find_visible(
     return visibility
 
 
-def spacing_of(positions: Float[np.ndarray, "points 3"]) -> float:
+def measure_spacing(positions: Float[np.ndarray, "points 3"]) -> float:
     """Median side of the square that a point represents, from a sample of the points; 0 for fewer than two points."""
-    return _spacing(cKDTree(positions))
+    return _measure_spacing(cKDTree(positions))
 
 
-def _spacing(tree: cKDTree) -> float:
+def _measure_spacing(tree: cKDTree) -> float:
     if tree.n < 2:
         return 0.0
-    count = min(NEIGHBOURS, tree.n)
+    count = min(NEIGHBORS, tree.n)
     radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count], workers=-1)[0]
     return float(np.median(radius)) * float(np.sqrt(np.pi / count))
 
@@ -158,7 +158,7 @@ def outward_normals(
 ) -> Float[np.ndarray, "points 3"]:
     """Unit normals of the points with these indices, outward by the votes of directions and thin walls (sides.py).
 
-    Linear colors split surfaces that nearly touch; `noise` is that of `planes`.
+    Linear colors split surfaces that nearly touch; `noise` is that of `estimate_normals`.
     """
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
@@ -173,7 +173,7 @@ def outward_normals(
         return jnp.asarray(np.pad(values.T, [(0, 0), (0, size - len(order))], constant_values=fill))
 
     color = np.asarray(base_color[voters], np.float32)
-    normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
+    normal = np.asarray(estimate_normals(positions[voters], positions, noise), np.float32)
     points = PointColumns(
         neighbors=columns(near, -1),
         mask=jnp.arange(size) < len(order),

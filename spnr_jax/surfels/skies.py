@@ -188,16 +188,16 @@ NAMED: dict[str, Callable[[int], Map]] = {
 def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
     """A sky of random colours with up to MOST_LAMPS lamps, from broad glows to suns of three degrees."""
 
-    def colour(brightness: float, tint: float) -> np.ndarray:
+    def random_color(brightness: float, tint: float) -> np.ndarray:
         return brightness * np.exp(tint * generator.standard_normal(3))
 
     above, around, below = np.exp(generator.normal(-1, 0.7, 3))
-    whole = gradient(colour(above, 0.3), colour(around, 0.3), colour(below, 0.3), height)
+    whole = gradient(random_color(above, 0.3), random_color(around, 0.3), random_color(below, 0.3), height)
     for _ in range(generator.integers(0, MOST_LAMPS + 1)):
         rise = np.degrees(np.arcsin(generator.uniform(-0.4, 1)))
         size = np.exp(generator.uniform(np.log(3), np.log(90)))
         power = np.exp(generator.normal(-0.3, 0.7))
-        whole = whole + lamp(generator.uniform(0, 360), rise, size, colour(power, 0.2), height)
+        whole = whole + lamp(generator.uniform(0, 360), rise, size, random_color(power, 0.2), height)
     return whole
 
 

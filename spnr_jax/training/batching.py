@@ -25,7 +25,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData, has_lights, on_white
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Batch, Camera, Light, PointCloud
-from spnr_jax.surfels.normals import find_visible, spacing_of
+from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 # --- batches ----------------------------------------------------------------------------------------------------------
 
@@ -167,16 +167,16 @@ BEHIND = 3.0  # spacings behind the first of its pixel that a scanner still sees
 BALLS = 0.03, 0.15  # radii of what is left out
 SHADED = 0.2, 0.7  # of a colour that a lamp's direction takes away at most
 NOISE, OUTLIERS = (0.001, 0.02), (0.002, 0.05)  # of random scans, drawn from the logarithm
-MISREGISTERED, COLOUR_NOISE = 0.004, 0.08  # at most
+MISREGISTERED, COLOR_NOISE = 0.004, 0.08  # at most
 THINNEST = 0.1  # density at one end of a cloud of uneven density, over that at the other
 
 
-def noisy(positions, values, rng, *, sigma: float) -> Points:
+def add_noise(positions, values, rng, *, sigma: float) -> Points:
     """Normally distributed errors of this standard deviation along each axis."""
     return positions + sigma * rng.normal(size=positions.shape), values
 
 
-def with_outliers(positions, values, rng, *, share: float) -> Points:
+def add_outliers(positions, values, rng, *, share: float) -> Points:
     """So many more points, uniform in the bounding box, with the columns of points drawn at random."""
     count = round(share * len(positions))
     low, high = positions.min(axis=0), positions.max(axis=0)
@@ -187,12 +187,12 @@ def with_outliers(positions, values, rng, *, share: float) -> Points:
     )
 
 
-def scan(positions, values, rng, *, scanners: int) -> Points:
+def simulate_scanners(positions, values, rng, *, scanners: int) -> Points:
     """What scanners in random directions from the middle see."""
-    spacing, seen = spacing_of(positions), np.zeros(len(positions), bool)
+    spacing, visible = measure_spacing(positions), np.zeros(len(positions), bool)
     for direction in rng.normal(size=(scanners, 3)):
-        seen |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
-    return positions[seen], {name: column[seen] for name, column in values.items()}
+        visible |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
+    return positions[visible], {name: column[visible] for name, column in values.items()}
 
 
 def misregister(positions, values, rng, *, sigma: float) -> Points:
@@ -209,13 +209,13 @@ def drop_balls(positions, values, rng, *, balls: int) -> Points:
     return positions[kept], {name: column[kept] for name, column in values.items()}
 
 
-def colour_noise(positions, values, rng, *, sigma: float) -> Points:
+def add_color_noise(positions, values, rng, *, sigma: float) -> Points:
     """Normally distributed errors of the base colours."""
     color = values["base_color"]
     return positions, values | {"base_color": np.clip(color + sigma * rng.normal(size=color.shape), 0, 1)}
 
 
-def colours_in_light(positions, values, rng) -> Points:
+def bake_light(positions, values, rng) -> Points:
     """Base colours darkened as a lamp in a grey room would, as a photograph has them; as they are without normals."""
     if "normals" not in values:
         return positions, values
@@ -225,13 +225,13 @@ def colours_in_light(positions, values, rng) -> Points:
     return positions, values | {"base_color": values["base_color"] * shade[:, None]}
 
 
-def colours_alone(positions, values, rng) -> Points:
+def drop_materials(positions, values, rng) -> Points:
     """Roughness 0.5 and metallic 0 everywhere and not known, as a file without materials is read."""
     flat = {"roughness": 0.5, "metallic": 0.0, "materials_known": 0.0}
     return positions, values | {name: np.full(len(positions), x, np.float32) for name, x in flat.items()}
 
 
-def uneven(positions, values, rng) -> Points:
+def thin_unevenly(positions, values, rng) -> Points:
     """A density that falls exponentially in a random direction, to THINNEST."""
     along = positions @ rng.normal(size=3)
     place = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
@@ -242,15 +242,15 @@ def uneven(positions, values, rng) -> Points:
 
 SCANS: tuple[tuple[float, Callable[[np.random.Generator], Fault]], ...] = (
     # of a random scan: the chance of each fault, and how it is drawn
-    (0.15, lambda rng: colours_in_light),
-    (0.4, lambda rng: functools.partial(scan, scanners=int(rng.integers(3, 9)))),
-    (0.2, lambda rng: uneven),
+    (0.15, lambda rng: bake_light),
+    (0.4, lambda rng: functools.partial(simulate_scanners, scanners=int(rng.integers(3, 9)))),
+    (0.2, lambda rng: thin_unevenly),
     (0.15, lambda rng: functools.partial(drop_balls, balls=int(rng.integers(1, 5)))),
     (0.15, lambda rng: functools.partial(misregister, sigma=rng.uniform(0, MISREGISTERED))),
-    (0.75, lambda rng: functools.partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
-    (0.35, lambda rng: functools.partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
-    (0.5, lambda rng: functools.partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE))),
-    (0.5, lambda rng: colours_alone),
+    (0.75, lambda rng: functools.partial(add_noise, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
+    (0.35, lambda rng: functools.partial(add_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
+    (0.5, lambda rng: functools.partial(add_color_noise, sigma=rng.uniform(0, COLOR_NOISE))),
+    (0.5, lambda rng: drop_materials),
 )
 
 

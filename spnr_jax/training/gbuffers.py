@@ -41,7 +41,7 @@ from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, compose_picture
 from spnr_jax.surfels import lighting, normals
-from spnr_jax.training.batching import colours_alone, random_scan, read_ahead
+from spnr_jax.training.batching import drop_materials, random_scan, read_ahead
 from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # per object
@@ -181,7 +181,7 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
         points, count = simulate_scan(points, generator), min(count, MOST_EVEN)
     else:
         if generator.random() < UNKNOWN_MATERIALS:
-            points = points._replace(values=colours_alone(*points[:2], generator)[1])
+            points = points._replace(values=drop_materials(*points[:2], generator)[1])
         if generator.random() < WITHOUT_NORMALS:
             alone = generator.random() < ALONE
             if not alone:

@@ -541,7 +541,7 @@ def render(volume, origins, directions, bias):
     )
     module, rays = inference.network(config), Rays(origins=origins, directions=directions)
     encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
-    traced = partial(paper_method.trace, samples=config.sampling, options=AS_TRAINED, key=None)
+    traced = partial(paper_method.render_rays, samples=config.sampling, options=AS_TRAINED, key=None)
     shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
 
     def draw(x):

@@ -77,7 +77,7 @@ def everything(module, x, directions):
     density, (rgb, hidden) = module(x, view)
     weights, _ = volume_weights(density, jnp.full(density.shape, 0.3))
     emitted = composite(weights, rgb), composite(weights, hidden)
-    return density, rgb, hidden, weights, view, module.finish(emitted, jnp.sum(weights, axis=-1), view)
+    return density, rgb, hidden, weights, view, module.decode(emitted, jnp.sum(weights, axis=-1), view)
 
 
 FIELD_VARIABLES = jax.jit(lambda key: FIELD.init(key, X, DIRECTIONS, method=everything))(jax.random.key(0))

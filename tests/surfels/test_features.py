@@ -89,9 +89,9 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
     zeros, ones = jnp.zeros((32, 32)), jnp.ones((32, 32))
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (32, 32, 3))
     buffer = shader.GBuffer(
-        opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
+        opacity=ones, coverage=ones, depth=depth, depth_deviation=zeros, log_spacing=jnp.log(0.1 * ones),
         normal=normal, color=normal, attributes=jnp.full((32, 32, 19), 0.5),
-        centres=ones, beside=jnp.zeros((32, 32, 2)),
+        sharp_weight=ones, centre_offset=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
     seen, _ = jax.jit(shader.compute_inputs)(buffer, light_of(sky()), view)

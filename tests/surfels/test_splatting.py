@@ -12,11 +12,11 @@ from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
 from spnr_jax.surfels import splatting
-from spnr_jax.surfels.splatting import shares
+from spnr_jax.surfels.splatting import compute_blend_weights
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
 blend = jax.jit(splatting.blend, static_argnames="slots")
-make_entries = jax.jit(splatting.make_entries, static_argnames="room")
+make_entries = jax.jit(splatting.make_entries, static_argnames="capacity")
 count = jax.jit(lambda found, view: splatting.count_entries(splatting.project_discs(found, view).covered))
 
 
@@ -65,14 +65,14 @@ class TestShares:
 
     def test_those_of_thin_layers_are_those_of_a_float64_loop(self):
         dense, (tau, *others) = 0.005, self.lists(0, 6.0)
-        share, left = shares(*map(jnp.asarray, (dense * tau, *others)))
+        share, left = compute_blend_weights(*map(jnp.asarray, (dense * tau, *others)))
         expected, behind = reference.shares(dense * tau, *others, splatting.COMPARED)
         close((share / dense, left), (expected / dense, behind), rtol=2e-5, atol=2e-6)
 
     def test_layers_that_are_well_apart_add_up_to_the_opacity_of_their_optical_depth(self):
         depth = np.repeat([1.0, 2.0, 3.0, 5.0], 6)[:, None] + 0.04 * np.sort(numbers(0, 4, 6), axis=1).reshape(-1, 1)
         tau = numbers(1, 24, 1, low=0.0, high=0.4)
-        share, left = shares(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
+        share, left = compute_blend_weights(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
         close(np.sum(share), -np.expm1(-np.sum(tau)), rtol=1e-5)
         close(left[6:12], np.full((6, 1), np.exp(-np.sum(tau[:6]))), rtol=1e-5)
 
