@@ -98,9 +98,9 @@ def set_up_jax(*, repeats: bool = True) -> None:
 
     Work that repeats itself on a CPU uses the memory of the time before.
     """
-    runtime.keep_programs()  # before JAX is imported
+    runtime.cache_programs()  # before JAX is imported
     if repeats:
-        runtime.keep_arrays()
+        runtime.reuse_memory()
 
 
 def _make_note(cloud: Path) -> Callable[[str], None]:

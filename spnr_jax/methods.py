@@ -26,7 +26,7 @@ from spnr_jax.presets import PRESETS
 Function = Callable[..., Any]
 
 
-def later(place: str) -> Function:
+def lazy(place: str) -> Function:
     """A function that imports "package.module:name" when it is first called, and calls it."""
     module, _, name = place.partition(":")
 
@@ -49,15 +49,15 @@ class Method:
     """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud,
     camera, key, train)`; or its location as "package.module:Name".  Values that it sows into "losses" are added to the
     loss."""
-    init: Function = later("spnr_jax.method.inference:init")
+    init: Function = lazy("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
-    encode: Function = later("spnr_jax.method.inference:encode_volume")
+    encode: Function = lazy("spnr_jax.method.inference:encode_volume")
     """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
-    render: Function = later("spnr_jax.method.inference:draw_each")
+    render: Function = lazy("spnr_jax.method.inference:draw_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
-    prepare: Function = later("spnr_jax.training.batching:prepare")
+    prepare: Function = lazy("spnr_jax.training.batching:prepare")
     """(config, dataset, run, *, light) -> function (first step) -> iterator of batches."""
-    loss: Function = later("spnr_jax.method.inference:loss")
+    loss: Function = lazy("spnr_jax.method.inference:loss")
     """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the params in `variables`."""
     discriminator: Function | None = None
     """(config) -> Linen module (image, condition, mask) -> logits, for a loss with a discriminator."""
@@ -89,11 +89,11 @@ class Outcome(NamedTuple):
 METHODS: dict[str, Method] = {
     "surfels": Method(
         config=SurfelConfig,
-        init=later("spnr_jax.method.surfel_method:init"),
-        encode=later("spnr_jax.method.surfel_method:encode"),
-        render=later("spnr_jax.method.surfel_method:render"),
-        prepare=later("spnr_jax.training.gbuffers:prepare"),
-        loss=later("spnr_jax.training.gbuffers:loss"),
+        init=lazy("spnr_jax.method.surfel_method:init"),
+        encode=lazy("spnr_jax.method.surfel_method:encode"),
+        render=lazy("spnr_jax.method.surfel_method:render"),
+        prepare=lazy("spnr_jax.training.gbuffers:prepare"),
+        loss=lazy("spnr_jax.training.gbuffers:loss"),
         takes_light=True,
         companions=("densifier",),
         label="Surfels",
@@ -101,15 +101,15 @@ METHODS: dict[str, Method] = {
     "paper": Method(
         config=PaperConfig,
         network="spnr_jax.method.paper_method:PaperNetwork",
-        encode=later("spnr_jax.method.paper_method:encode"),
-        render=later("spnr_jax.method.paper_method:render"),
-        discriminator=later("spnr_jax.method.paper_method:discriminator"),
+        encode=lazy("spnr_jax.method.paper_method:encode"),
+        render=lazy("spnr_jax.method.paper_method:render"),
+        discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
         label="The paper's network",
     ),
 }
 
 
-GONE = "trains"  # a field of earlier versions that weights files still contain
+REMOVED_FIELD = "trains"  # a field of earlier versions that weights files still contain
 
 
 class UnknownMethod(UserError):
@@ -172,7 +172,7 @@ def network(config: NetworkConfig) -> Any:
     """The Linen module for a network's config; its code is imported at the first call."""
     made = method_of(config).network
     assert made is not None, f"{config.method} is no Linen module"
-    return (later(made) if isinstance(made, str) else made)(config)
+    return (lazy(made) if isinstance(made, str) else made)(config)
 
 
 def method_of(config: NetworkConfig) -> Method:
@@ -198,7 +198,7 @@ def to_dict(config: TrainConfig) -> dict:
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
     kinds = types_of(kind)
-    values = {name: value for name, value in values.items() if f"{path}{name}" != GONE}
+    values = {name: value for name, value in values.items() if f"{path}{name}" != REMOVED_FIELD}
     for name in values:
         require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}

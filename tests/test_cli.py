@@ -124,7 +124,7 @@ SETTING_UP = """
 import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import runtime
-runtime.keep = lambda: print("kept", end=" ")
+runtime.keep_freed_memory = lambda: print("kept", end=" ")
 cli.RUN = dict.fromkeys(cli.RUN, lambda command: None)
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)

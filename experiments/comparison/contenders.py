@@ -45,7 +45,7 @@ class Method:
 
     def show(self, item: ObjectData) -> Pictures:
         """The pictures."""
-        return evaluation.on_host(self.draw(self.encode(item), item))
+        return evaluation.to_numpy(self.draw(self.encode(item), item))
 
 
 def of_network(training: TrainConfig, variables: dict) -> Method:

@@ -189,7 +189,7 @@ def score_objects(
     `more` scores a method's pictures of an object in other ways, too.
     """
     seconds: dict[str, list[float]] = {method: [] for method in methods}
-    scores, shown, to_show = {}, [], evaluation.spread(names, num_shown)
+    scores, shown, to_show = {}, [], evaluation.pick_evenly(names, num_shown)
     for name in tqdm(names, desc="scoring"):
         item = data_sets.read_object(dataset, name)
         item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))

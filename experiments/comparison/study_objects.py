@@ -23,7 +23,7 @@ def test_objects(dataset: Dataset, count: int | None) -> tuple[str, ...]:
         raise UserError(f"{dataset.folder}: the test split is empty; generate more objects")
     if count is not None and count < 1:
         raise UserError(f"--objects: expected 1 or more, got {count}")
-    return evaluation.spread(names, count or len(names))
+    return evaluation.pick_evenly(names, count or len(names))
 
 
 def cut(

@@ -120,7 +120,7 @@ def main(options: InverseStudy) -> None:
     rows = ["target", *(f"{task}, {when}" for task in RATES for when in ("start", "end"))]
     files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size))}
     asked = {"points": truth.cloud.mask.shape[1], "size": size, "steps": steps, "plan": plan._asdict()}
-    asked |= {"hardware": runtime.hardware(), "load": runtime.load()}
+    asked |= {"hardware": runtime.describe_hardware(), "load": runtime.measure_load()}
     note = f"{asked['points']} points, {size} px, {steps} steps; {asked['hardware']}, load {asked['load']}."
     results = asked | {"objects": list(objects), "tasks": found, "gradients": checks}
     results_folder.write(options.out, results, make_tables(found, checks, list(objects)), [note], files)

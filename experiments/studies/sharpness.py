@@ -104,7 +104,9 @@ def main(options: SharpnessStudy) -> None:
         rows=tuple(_row(row, objects, known[row]) for row, objects in found.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
-    results_folder.write(options.out, {"objects": found, "known": known, "hardware": runtime.hardware()}, [table])
+    results_folder.write(
+        options.out, {"objects": found, "known": known, "hardware": runtime.describe_hardware()}, [table]
+    )
 
 
 def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectData) -> Measured:

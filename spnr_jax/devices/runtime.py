@@ -1,11 +1,11 @@
-"""What a process asks of its machine: threads, workers, memory that stays, kept programs; what the machine is.
+"""What a process asks of its machine: threads, workers, memory reuse, cached programs; and what the machine is.
 
-glibc's allocator is asked for speed and so that memory does not grow; other C libraries are left alone.  Nothing here
-imports JAX before it is called: `keep_programs` comes before that.
+glibc's allocator is tuned for speed and so that memory does not grow; other C libraries are left alone.  Nothing here
+imports JAX before it is called: `cache_programs` comes before that.
 
-A worker is a fresh process with one thread (the noise of Mitsuba depends on its thread count), which has one task at a
-time.  It is killed with its parent, however that ends.  A worker may be killed at any time, by LLVM or for want of
-memory: this costs its own task alone, which is tried again when the others are done, with no other beside it.
+A worker is a fresh process with one thread (Mitsuba's noise depends on the number of threads), which has one task at a
+time.  It is killed with its parent, however that ends.  A worker may be killed at any time, by LLVM or for lack of
+memory: only its own task is lost, which is tried again when the others are done, with no other beside it.
 """
 
 import ctypes
@@ -33,9 +33,9 @@ Result = TypeVar("Result")
 
 
 def run_ahead(jobs: Iterable[Callable[[], Result]], threads: int = 1, most: int = 1) -> Iterator[Result]:
-    """Results of the jobs in their order; threads do `most` of them ahead, while others are made or used here.
+    """Results of the jobs in their order; threads run up to `most` of them ahead.
 
-    What is raised by a job, or while one is made, is raised here; jobs that have not begun are dropped then.
+    An exception in a job, or while one is made, is raised here; jobs that have not started are then dropped.
     """
     pool, waiting = ThreadPoolExecutor(threads), deque[Future]()
     try:
@@ -50,7 +50,7 @@ def run_ahead(jobs: Iterable[Callable[[], Result]], threads: int = 1, most: int 
 
 
 def two_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Results of the work on each item, in their order; the first is computed alone: what it compiles serves others."""
+    """Results of the work on each item, in order; the first runs alone, so that the others reuse what it compiles."""
     jobs = (partial(work, item) for item in items)
     yield from (job() for job in islice(jobs, 1))
     yield from run_ahead(jobs, threads=2)
@@ -167,39 +167,39 @@ def _end_with_parent() -> None:
 TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # M_... of malloc.h
 
 
-def keep_arrays() -> None:
-    """Makes JAX on a CPU reuse the heap of the step before (mallopt), without page faults; call it before JAX computes.
+def reuse_memory() -> None:
+    """Makes JAX on a CPU reuse the heap of the previous step (mallopt), without page faults; call it before JAX runs.
 
-    Else the system fetches and clears a step's temporary memory each time, a fifth of the step.  JAX computes in the
-    thread that calls it then: other threads' arenas hold 64 MB at most, whatever glibc is asked.
+    Otherwise the system maps and clears a step's temporary memory each time, which takes a fifth of the step.  JAX then
+    computes in the calling thread: arenas of other threads hold at most 64 MB.
     """
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    keep()
+    keep_freed_memory()
 
 
-def keep() -> None:
-    """Has memory that is freed stay in the process until it is given back."""
-    _ask(lambda libc: libc.mallopt(MMAP_MAX, 0))
-    _ask(lambda libc: libc.mallopt(TRIM_THRESHOLD, 2**31 - 1))
+def keep_freed_memory() -> None:
+    """Keeps freed memory in the process until it is trimmed."""
+    _call_libc(lambda libc: libc.mallopt(MMAP_MAX, 0))
+    _call_libc(lambda libc: libc.mallopt(TRIM_THRESHOLD, 2**31 - 1))
 
 
-def few_arenas() -> None:
-    """Has the threads that begin from now on share arenas, as many as there are cores.
+def limit_arenas() -> None:
+    """Makes threads that start from now on share as many arenas as there are cores.
 
-    Each batch, row and checkpoint is made by other threads than the one before; with an arena for each, what they free
-    stays scattered over all of them.  With fewer arenas than cores the threads of one step would wait for each other.
+    Each batch, row and checkpoint is made by new threads; with an arena for each, freed memory would stay scattered
+    over all of them.  With fewer arenas than cores, the threads of one step would wait for each other.
     """
-    _ask(lambda libc: libc.mallopt(ARENA_MAX, os.cpu_count() or 1))
+    _call_libc(lambda libc: libc.mallopt(ARENA_MAX, os.cpu_count() or 1))
 
 
-def give_back() -> None:
-    """Has freed memory go back to the system: of Orbax's glibc keeps 130 MB, and 1 MB more after each save."""
-    _ask(lambda libc: libc.malloc_trim(0))
+def trim_memory() -> None:
+    """Returns freed memory to the system; otherwise glibc keeps 130 MB after Orbax saves, and more each time."""
+    _call_libc(lambda libc: libc.malloc_trim(0))
 
 
-def _ask(what: Callable[[ctypes.CDLL], int]) -> None:
+def _call_libc(what: Callable[[ctypes.CDLL], int]) -> None:
     try:
         what(ctypes.CDLL("libc.so.6"))
     except (OSError, AttributeError):
@@ -209,44 +209,44 @@ def _ask(what: Callable[[ctypes.CDLL], int]) -> None:
 # --- programs on the disk ---------------------------------------------------------------------------------------------
 
 
-SHORTEST = 0.1  # seconds of compilation from which on a program is kept
-# options of XLA for an outermost jit: a third to two thirds off the compilation of long programs, which run as long
+SHORTEST = 0.1  # seconds of compilation above which a program is cached
+# XLA options for an outermost jit: long programs compile in one to two thirds of the time, and run as fast
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
-LOOKED_AT = "looked-at"  # file whose time says up to when entries are known to be whole
+CHECK_MARK = "looked-at"  # file whose time says up to when entries are known to be complete
 
 
-def folder() -> Path:
-    """Where this package keeps what can be made again, of this user."""
+def cache_folder() -> Path:
+    """Folder of this user's cached files."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spnr_jax"
 
 
-def keep_programs() -> None:
+def cache_programs() -> None:
     """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
 
-    On some processors XLA logs two long errors for each program that it reads, though nothing is wrong with it
-    (openxla/xla#44565).  Where JAX is not imported yet they stay off the terminal; TF_CPP_MIN_LOG_LEVEL=2 shows them.
+    On some processors, XLA logs two long errors for each program that it reads, though nothing is wrong
+    (openxla/xla#44565).  They are hidden if JAX is not imported yet; TF_CPP_MIN_LOG_LEVEL=2 shows them.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(folder()))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
     with suppress(OSError):  # there is none yet, or it is not ours to mend
         remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))
 
 
 def remove_broken(cache: Path) -> None:
-    """Removes entries that are cut off, as a process leaves them that was killed while it wrote.
+    """Removes truncated entries of processes that were killed while writing.
 
-    JAX would warn of them and compile in every run, for it does not write over what is there.  Only what was written
-    since the last look is read.
+    JAX would warn of them and compile in every run, because it does not overwrite entries.  Only entries written since
+    the last check are read.
     """
     from jax._src.compilation_cache import decompress_executable  # there is no public way to read an entry
 
-    begin, mark = time.time_ns(), cache / LOOKED_AT
+    begin, mark = time.time_ns(), cache / CHECK_MARK
     last = mark.stat().st_mtime_ns if mark.exists() else 0
     for entry in os.scandir(cache):
         if entry.name.endswith("-cache") and entry.stat().st_mtime_ns >= last:
@@ -266,8 +266,8 @@ def remove_broken(cache: Path) -> None:
 CPUINFO = Path("/proc/cpuinfo")
 
 
-def hardware() -> str:
-    """The device that JAX uses, in words."""
+def describe_hardware() -> str:
+    """The device that JAX uses."""
     import jax
 
     device = jax.devices()[0]
@@ -278,6 +278,6 @@ def hardware() -> str:
     return f"{len(os.sched_getaffinity(0))} cores of {(names or [platform.machine()])[0]}"
 
 
-def load() -> float:
-    """Threads that ran or waited to run on this machine, mean of the last minute: those of others, too."""
+def measure_load() -> float:
+    """Load average of the machine over the last minute, other users included."""
     return round(os.getloadavg()[0], 1)

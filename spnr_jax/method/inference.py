@@ -185,7 +185,7 @@ def _render(
     options: RenderOptions | None,
 ) -> Rendering:
     """One view; depth in the cloud's units."""
-    scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.in_box(camera, centre, scale)))
+    scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.move_into_box(camera, centre, scale)))
     rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config, options=options)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0], rendering)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from spnr_jax.config import SurfelConfig
-from spnr_jax.devices.programs import Kept
+from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge
@@ -125,21 +125,21 @@ def draw_planned(variables: dict | None, volume: Volume, planned: PlannedView, s
     return _shade(variables, volume.scene, planned.camera, planned.light, window_buffer, plan=plan)
 
 
-@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
+@partial(CachedProgram, returns=(SurfelScene, Surfels), options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
     return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), CONSTANTS)
 
 
-_densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
-_rasterize = Kept(surfel_renderer.rasterize_window, static="plan", returns=(WindowBuffer, GBuffer))
-_shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
+_densify = CachedProgram(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
+_rasterize = CachedProgram(surfel_renderer.rasterize_window, static="plan", returns=(WindowBuffer, GBuffer))
+_shade = CachedProgram(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
 _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 
 @jax.jit
 def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
     """An empty view: the object is not visible."""
-    inside = cameras.in_box(camera, scene.centre, scene.scale)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
     image, depth, acc = surfel_renderer.paste_window(*nothing, inside, 1)
     overflow = jnp.zeros((), jnp.int32)

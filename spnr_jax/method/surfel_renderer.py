@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.devices.programs import Kept
+from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.imaging import WHITE, double_size, mean_of_squares
@@ -111,10 +111,10 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
     return doublings, 2 if pixels < finest else 1
 
 
-@partial(Kept, static=("doublings", "side"), returns=(Sizes,))
+@partial(CachedProgram, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
-    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
+    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
     window = crop_camera(whole, corner, width, height)
     foot = splatting.project_discs(scene.surfels, window)
@@ -225,7 +225,7 @@ class WindowBuffer(NamedTuple):
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
-    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
+    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
     corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
     window = crop_camera(whole, corner, plan.width, plan.height)
     buffer, overflow = rasterize(scene.surfels, window, light, capacity=plan.entries, slots=plan.slots)
@@ -243,7 +243,7 @@ def shade_window(
     plan: Plan,
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
-    inside = cameras.in_box(camera, scene.centre, scene.scale)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     window = crop_camera(scale_camera(inside, plan.doublings, plan.side), window_buffer.corner, plan.width, plan.height)
     drawn = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
     image, depth, acc = paste_window(drawn, window_buffer.corner * 2**plan.doublings, inside, plan.side)

@@ -57,7 +57,7 @@ def compute_attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
     reflected = jnp.sum(surfels.visibility * lobe, axis=1) / jnp.sum(lobe, axis=1)
-    parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
+    parts = [surfels.roughness, surfels.metallic, lighting.gather_irradiance(surfels, light), reflected, openness]
     parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape_ratios]
     parts += [surfels.one_sided, surfels.materials_unknown, surfels.learned, jnp.mean(surfels.base_color, axis=1) ** 2]
     return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)

@@ -86,14 +86,14 @@ def _score(
 def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float) -> tuple[Array, Array]:
     """Image and opacity of a trivial renderer for all views of one cloud."""
     if method == "white":
-        image = white(camera)
+        image = render_white(camera)
         return image, jnp.zeros(image.shape[:-1])
-    return _draw_floor(cloud, camera, jnp.float32(factor * spacing(cloud)), method=method)
+    return _draw_floor(cloud, camera, jnp.float32(factor * measure_nearest_distance(cloud)), method=method)
 
 
 @partial(jax.jit, static_argnames="method")
 def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
-    draw = {"splat": splat, "nearest": nearest}[method]
+    draw = {"splat": render_splat, "nearest": render_nearest}[method]
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
@@ -146,7 +146,7 @@ def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_
     for method, show in methods.items():
         shown = show(cloud, item.camera)
         scores[method] = score_pictures(item, shown)
-        pictures[method] = on_host(shown)
+        pictures[method] = to_numpy(shown)
     return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
 
 
@@ -160,7 +160,7 @@ def score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
     return scores if distance is None else scores | {"lpips": distance}
 
 
-def on_host(pictures: Pictures) -> Pictures:
+def to_numpy(pictures: Pictures) -> Pictures:
     """The pictures as NumPy arrays, the image in [0, 1]."""
     depth = None if pictures.depth is None else np.asarray(pictures.depth)
     return Pictures(image=np.clip(np.asarray(pictures.image), 0, 1), acc=np.asarray(pictures.acc), depth=depth)
@@ -175,7 +175,7 @@ class Evaluation:
     gallery: list[ObjectResult]
 
 
-def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+def pick_evenly(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     """So many of the names, evenly from the first to the last."""
     return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
 
@@ -196,7 +196,7 @@ def score_methods(
     """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
-    shown = spread(names, gallery_objects)
+    shown = pick_evenly(names, gallery_objects)
     for i, name in enumerate(names):
         result = evaluate_object(methods, config, data_sets.read_object(dataset, name))
         scores[name] = result.scores
@@ -246,7 +246,7 @@ def compare(
         "preset": config.preset,
         "steps": trained[first].steps,
         "seed": config.seed,
-        "hardware": runtime.hardware(),
+        "hardware": runtime.describe_hardware(),
         "settings": {
             "split": split,
             "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
@@ -261,12 +261,12 @@ def compare(
 # --- the trivial renderers --------------------------------------------------------------------------------------------
 
 
-def white(camera: Camera) -> Float[Array, "*batch height width 3"]:
+def render_white(camera: Camera) -> Float[Array, "*batch height width 3"]:
     """The white image."""
     return jnp.ones((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3))
 
 
-def splat(
+def render_splat(
     cloud: PointCloud, camera: Camera, radius: Float[Array, ""] | float
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
     """sRGB image and opacity (0 or 1) of discs around the points; the disc nearest in camera depth wins."""
@@ -283,7 +283,7 @@ def splat(
     return _shade_first(cloud, camera, order)
 
 
-def nearest(
+def render_nearest(
     cloud: PointCloud, camera: Camera, radius: Float[Array, ""] | float
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
     """sRGB image and opacity (0 or 1) of the union of balls around the points, coloured by the nearest point.
@@ -305,7 +305,7 @@ def nearest(
     return _shade_first(cloud, camera, order)
 
 
-def spacing(cloud: PointCloud) -> float:
+def measure_nearest_distance(cloud: PointCloud) -> float:
     """Median distance of a real point to its nearest other, in world units; 0 for fewer than two points."""
     real = np.asarray(cloud.positions)[np.asarray(cloud.mask)]
     return float(np.median(cKDTree(real).query(real, 2)[0][:, 1])) if len(real) > 1 else 0.0

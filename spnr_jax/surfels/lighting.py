@@ -42,17 +42,17 @@ def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
 
 def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
     """The map at another size: each texel is the mean, by solid angle, of those that it overlaps; energy is kept."""
-    rows = _shares(
+    rows = _overlap(
         -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
         -np.cos(np.pi * np.arange(height + 1) / height),
     )
-    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
+    columns = _overlap(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
     xp = namespace(envmap)
     narrow = xp.tensordot(rows, envmap, axes=(1, 0))
     return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
 
 
-def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _overlap(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Share of each old interval in each new one (new, old), from sorted edges."""
     overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
     return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
@@ -162,7 +162,7 @@ def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
     return two[0] - 1.04 * grazing, two[1] + 1.04 * grazing
 
 
-def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
+def gather_irradiance(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
     """Irradiance / pi of each surfel from the directions that it is visible from."""
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     tables = jnp.asarray(light.tables)[1 + BLUR_LEVEL].reshape(-1, 3)

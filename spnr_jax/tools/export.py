@@ -54,7 +54,7 @@ from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Export, Render, Share
-from spnr_jax.tools.pictures import Ready, prepare_cloud
+from spnr_jax.tools.pictures import PreparedObject, prepare_cloud
 from spnr_jax.training import weights
 
 # --- objects ----------------------------------------------------------------------------------------------------------
@@ -68,15 +68,15 @@ Say = Callable[[str], None]
 
 def export_object(options: Export, note: Say) -> str:
     """Writes a cloud's splats; a line about it.  `note` gets the assumptions about the cloud."""
-    asked = as_rendered(options, options.run, options.network)
+    asked = make_render_options(options, options.run, options.network)
     assert options.splats is not None
     check_suffix(options.splats)
     made = _splats(prepare_cloud(asked, note), options, note)
-    size = write_splats(options.splats, made, make_note(asked))
+    size = write_splats(options.splats, made, describe_source(asked))
     return f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)"
 
 
-def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Render:
+def make_render_options(options: Export | Share, cloud: Path, run: Path | None) -> Render:
     """What the options ask of a cloud, as those of `spnr render`."""
     return Render(
         cloud=cloud,
@@ -88,28 +88,28 @@ def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Rende
     )
 
 
-def make_note(asked: Render) -> str:
+def describe_source(asked: Render) -> str:
     """The line that names cloud, network and light, without folders."""
     light = Path(asked.lighting.light or ("sun" if asked.lighting.sun else "room")).name
-    return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.SHIPPED).name}), light: {light}"
+    return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.PACKAGED).name}), light: {light}"
 
 
 def share(options: Share, note: Say) -> str:
     """Writes the page of a cloud; a line about it.  `note` gets the assumptions about the cloud."""
     images.check_place(options.out)
-    asked = as_rendered(options, options.cloud, options.run)
+    asked = make_render_options(options, options.cloud, options.run)
     ready = prepare_cloud(asked, note)
     gaussians = _splats(ready, options, note)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
-    said = " · ".join(filter(None, [make_note(asked), options.credit]))
+    said = " · ".join(filter(None, [describe_source(asked), options.credit]))
     view = (options.azimuth, options.elevation)
     content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, said)
     images.write_whole(options.out, content)
     return f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)"
 
 
-def _splats(ready: Ready, options: Export | Share, note: Say) -> Gaussians:
+def _splats(ready: PreparedObject, options: Export | Share, note: Say) -> Gaussians:
     how = options.making
     gaussians = surfaces.splats(
         ready.model,

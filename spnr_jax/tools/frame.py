@@ -24,11 +24,11 @@ from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Lighting
-from spnr_jax.tools.pictures import before, light_of_options
+from spnr_jax.tools.pictures import light_of_options, put_background
 
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
-OBJECT = 1.2  # radius of a ball in the box that holds all that is drawn of the object; its points lie within 1
+OBJECT_RADIUS = 1.2  # radius of a ball in the box that holds all that is drawn of the object; its points lie within 1
 FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
 MOST_PIXELS = 2**16  # along a side of a browser's canvas
 NARROWEST, WIDEST = 1e-3, np.deg2rad(150)
@@ -128,8 +128,8 @@ def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
     reach = square_reach(view, whole=behind != "white")
     camera, light = square_camera(view, state.volume, reach, size), state.light()
     rendering = model.render(state.volume, camera, quality, light)
-    square = images.to_uint8(before(behind, rendering, camera, light).image)
-    return fill(square, view, reach, MOVING_LONGEST if moving else LONGEST)
+    square = images.to_uint8(put_background(behind, rendering, camera, light).image)
+    return place_square(square, view, reach, MOVING_LONGEST if moving else LONGEST)
 
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
@@ -153,10 +153,10 @@ def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: 
 def square_reach(view: View, whole: bool) -> float:
     """The reach of the square that holds the object or, if that is less or `whole` is wanted, covers the canvas."""
     covering, distance = _covering(view), np.linalg.norm(view.position)
-    if whole or distance <= OBJECT:
+    if whole or distance <= OBJECT_RADIUS:
         return covering
     aside = np.arccos(np.clip(view.position @ view.rotation[:, 2] / distance, -1, 1))  # of the object's middle
-    furthest = aside + np.arcsin(OBJECT / distance)
+    furthest = aside + np.arcsin(OBJECT_RADIUS / distance)
     return covering if furthest >= np.pi / 2 else min(covering, float(np.tan(furthest)))
 
 
@@ -169,7 +169,7 @@ def square_camera(view: View, volume: Volume, reach: float, size: int) -> Camera
     return Camera(cam_to_world=pose, intrinsics=intrinsics, height=size, width=size)
 
 
-def fill(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
+def place_square(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
     """The canvas, at most `longest` pixels along its longer side, with a square picture in its middle, on white."""
     shrink = min(1.0, longest / max(view.width, view.height))
     width, height = (max(round(side * shrink), 1) for side in (view.width, view.height))

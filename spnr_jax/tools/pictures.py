@@ -60,17 +60,17 @@ def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> N
         )
 
 
-def before(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
+def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
     """The picture before what is wanted behind it: white, as it is, or the map of the light."""
     if wanted == "white" or light is None:
         return rendering
-    behind = np.asarray(_behind(light, camera))
+    behind = np.asarray(_draw_background(light, camera))
     image = np.asarray(rendering.image) + (1 - np.asarray(rendering.acc))[..., None] * (behind - 1)
     return dataclasses.replace(rendering, image=image)
 
 
 @jax.jit
-def _behind(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
+def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
     """The light's map as a camera sees it, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
     return linear_to_srgb(jnp.minimum(jnp.stack(background(light, towards), axis=-1), 1))
@@ -81,7 +81,7 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ready:
+class PreparedObject:
     """A cloud that is read and encoded, and what draws it."""
 
     placed: PlacedCloud
@@ -98,7 +98,7 @@ def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
     yield from run_ahead(draw_all(ready, options, options.out / options.cloud.stem))
 
 
-def prepare_cloud(options: Render, note: Callable[[str], None]) -> Ready:
+def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObject:
     """The cloud of the options read and encoded; `note` gets the assumptions about it.
 
     ValueError, before the cloud is read, for a run that is none or a network that cannot draw what is asked for.
@@ -116,10 +116,10 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> Ready:
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    return Ready(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
+    return PreparedObject(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
 
 
-def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], str]]:
+def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Callable[[], str]]:
     """Draws what the options ask for; yields what writes it, in any thread, and gives a line about it.
 
     Stills and film are drawn in one go: views that share their sizes share their programs.
@@ -140,13 +140,13 @@ def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[],
 View = tuple[Camera, Light | None]
 
 
-def still_views(ready: Ready, options: Render) -> list[View]:
+def still_views(ready: PreparedObject, options: Render) -> list[View]:
     """Cameras evenly around the object, and its light."""
     turns = np.arange(options.views) * 360 / max(options.views, 1)
     return [(_camera(ready, FIRST_AZIMUTH + turn, options), ready.light) for turn in turns]
 
 
-def turntable_views(ready: Ready, options: Render) -> list[View]:
+def turntable_views(ready: PreparedObject, options: Render) -> list[View]:
     """Camera and light of each image of one turn around the object, or of its light."""
     turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
     if options.turn == "object" or light is None:
@@ -154,16 +154,16 @@ def turntable_views(ready: Ready, options: Render) -> list[View]:
     return [(_camera(ready, FIRST_AZIMUTH, options), light.turned(turn)) for turn in turns]
 
 
-def _camera(ready: Ready, azimuth: float, options: Render) -> Camera:
+def _camera(ready: PreparedObject, azimuth: float, options: Render) -> Camera:
     return ready.model.camera(ready.volume, float(azimuth), options.elevation, options.resolution)
 
 
-def _draw(ready: Ready, views: list[View], options: Render) -> Iterator[Rendering]:
+def _draw(ready: PreparedObject, views: list[View], options: Render) -> Iterator[Rendering]:
     """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
     cameras, lights = [camera for camera, _ in views], [light for _, light in views]
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
     for (camera, light), rendering in zip(views, renderings, strict=True):
-        yield before(options.lighting.background, rendering, camera, light)
+        yield put_background(options.lighting.background, rendering, camera, light)
 
 
 def _write_still(stem: str, files: Iterator[tuple[str, bytes]]) -> str:

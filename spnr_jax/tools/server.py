@@ -48,7 +48,7 @@ DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # which a browser leaves out o
 _guarding = threading.Lock()
 Shown = TypeVar("Shown")
 
-Asked = Callable[[Any, Request], Any]
+RequestHook = Callable[[Any, Request], Any]
 
 
 def new_token() -> str:
@@ -83,7 +83,7 @@ def _refusal(why: str) -> Response:
 
 
 @contextlib.contextmanager
-def guard(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
+def require_token(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
     """Servers of websockets that are opened meanwhile, in whatever thread, admit what knows the token; their list.
 
     viser opens its server in its own thread and has no hook for who is let in, hence the replaced function.
@@ -91,7 +91,7 @@ def guard(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
     original: Any = websockets.asyncio.server.serve
     opened: list[Any] = []
 
-    def serve(*arguments: Any, process_request: Asked | None = None, **options: Any) -> Any:
+    def serve(*arguments: Any, process_request: RequestHook | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
             answer = admit(request, token, reached_at)
             if isinstance(answer, Response) or process_request is None:
@@ -323,7 +323,10 @@ class Viewer:
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
         token = new_token()
-        with guard(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
+        with (
+            require_token(token, reached_at) as opened,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()

@@ -28,7 +28,7 @@ KEPT = 3  # newest checkpoints that stay
 
 
 @contextmanager
-def alone(run: Path) -> Iterator[None]:
+def lock_run(run: Path) -> Iterator[None]:
     """While it lasts no other process trains in the run folder, which is made; ValueError if one does already.
 
     The operating system releases the lock when the process exits, however it exits.
@@ -107,7 +107,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
         ) from None
-    runtime.give_back()
+    runtime.trim_memory()
 
 
 def restore(

@@ -81,11 +81,11 @@ def prepare(
 ) -> Callable[[int], Generator[Crops, None, None]]:
     """A function from a step to the training batches from there on.  Missing G-buffers are made first (slow)."""
     variables = add_companions(config.model, {}, run)
-    views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
+    views = make_missing(dataset, light or choose_light(dataset), config, run / "gbuffers", variables)
     return lambda first_step: batches(views, config, first_step)
 
 
-def light_of(dataset: Dataset) -> Light:
+def choose_light(dataset: Dataset) -> Light:
     """The light of a data set without a light per view; ValueError if it is not the room."""
     described = dataset.settings.get("environment_map")
     name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
@@ -124,7 +124,7 @@ def loss(
     )
 
 
-def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
+def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
     """The views of the data set; missing and broken files are made first; `variables` hold the densifier."""
     views = []
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
@@ -134,7 +134,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
                 programs.make_room()
-                arrays = make(item, number, light, config, variables)
+                arrays = make_views(item, number, light, config, variables)
                 write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
@@ -152,7 +152,7 @@ def _doublings(path: Path) -> list[int] | None:
         return None
 
 
-def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
+def make_views(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud with this index."""
     generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
@@ -236,7 +236,7 @@ def make_view(
     }
 
 
-@partial(jax.jit, static_argnames=("room", "slots"))
+@partial(jax.jit, static_argnames=("capacity", "slots"))
 def prepare_view(
     surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:

@@ -29,7 +29,7 @@ from spnr_jax.methods import UnknownMethod, from_dict, include, method_of, to_di
 # what a header of any content makes its readers raise
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 ADVICE = "write one with `spnr export RUN`"
-SHIPPED = "surfels"  # the network of the package, named as its preset
+PACKAGED = "surfels"  # the network of the package, named as its preset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Trained:
     steps: int
 
 
-def packaged_file(name: str = SHIPPED) -> Path:
+def packaged_file(name: str = PACKAGED) -> Path:
     """The file of weights that the package holds under a name: its network, or "densifier"."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
@@ -56,9 +56,9 @@ def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict
     return variables | {name: read_variables(path) for name, path in files.items()}
 
 
-def place(source: Path | str | None) -> Path:
+def locate(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
-    return packaged_file() if source is None or str(source) == SHIPPED else Path(source)
+    return packaged_file() if source is None or str(source) == PACKAGED else Path(source)
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print) -> Trained:
@@ -66,7 +66,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print) 
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint.
     """
-    path = place(source)
+    path = locate(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
         return replace(trained, variables=add_companions(trained.config.model, trained.variables, path.parent))

@@ -271,10 +271,12 @@ def mirrors(light, directions, roughness):
 
 
 def arrives(light, visible, normal):
-    """Irradiance, as `lighting.arriving` has it of surfels."""
+    """Irradiance, as `lighting.gather_irradiance` has it of surfels."""
     count = visible.shape[-1]
     found = surfels(np.zeros((count, 3)), (0.0, 0.0, 1.0), 0.1)
-    return lighting.arriving(dataclasses.replace(found, visibility=visible.T, normal=normal.T), Light(tables=light)).T
+    return lighting.gather_irradiance(
+        dataclasses.replace(found, visibility=visible.T, normal=normal.T), Light(tables=light)
+    ).T
 
 
 def shade(outputs, maps, ambient):

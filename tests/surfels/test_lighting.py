@@ -14,7 +14,7 @@ from spnr_jax.surfels.sides import DIRECTIONS
 
 COLOR = np.array([0.3, 1.0, 2.0])
 irradiance, reflect, look_up = map(jax.jit, (lighting.irradiance, lighting.reflect, lighting.look_up))
-arriving, project_harmonics = jax.jit(lighting.arriving), jax.jit(lighting.project_harmonics)
+arriving, project_harmonics = jax.jit(lighting.gather_irradiance), jax.jit(lighting.project_harmonics)
 harmonics = jax.jit(lighting.harmonics)
 
 

@@ -38,7 +38,7 @@ def grouped(views):
 
 def made(seed, number):
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
-    return gbuffers.make(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
+    return gbuffers.make_views(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
 
 
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
@@ -76,7 +76,7 @@ def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_b
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    again = gbuffers.complete(tiny_surfels.dataset(), LIGHT, CONFIG, folder, {})
+    again = gbuffers.make_missing(tiny_surfels.dataset(), LIGHT, CONFIG, folder, {})
     assert [view._replace(path=view.path.name) for view in again] == [v._replace(path=v.path.name) for v in views]
     assert broken.read_bytes() == whole
     assert {path for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]} == {broken}
@@ -260,10 +260,10 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(m
 
 def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
     dataset = tiny_surfels.dataset()
-    assert gbuffers.light_of(dataset) is lighting.room_light()
+    assert gbuffers.choose_light(dataset) is lighting.room_light()
     other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
     with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
-        gbuffers.light_of(other)
+        gbuffers.choose_light(other)
 
 
 def test_networks_of_rays_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):
