@@ -47,7 +47,7 @@ from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.scoring.report import Table, number
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.geometry import fit_box
-from spnr_jax.surfels.lighting import directions, solid_angles
+from spnr_jax.surfels.lighting import solid_angles, texel_directions
 
 TURN, SHIFT, MOVED = np.deg2rad(8.0), 0.1, 0.5  # of a wrong pose, in radians and radii; of points, in spacings
 GREY = 0.5  # where materials begin
@@ -172,7 +172,7 @@ def place(cloud: PointCloud, number_of: int, size: int) -> Truth:
 
 def harmonics() -> Float[np.ndarray, "32 64 9"]:
     """The first nine real spherical harmonics at the texels of a light's map."""
-    towards = np.moveaxis(directions(lighting.HEIGHT).astype(np.float32), -1, 0)
+    towards = np.moveaxis(texel_directions(lighting.HEIGHT).astype(np.float32), -1, 0)
     return np.stack([np.asarray(x) for x in lighting.harmonics(*map(jnp.asarray, towards))], axis=-1)
 
 

@@ -132,13 +132,13 @@ def find_outliers(positions: Float[np.ndarray, "points 3"], strength: Strength =
         if not outlier.any():
             break
         left, tree = left[~outlier], cKDTree(distinct[left[~outlier]])
-        distances, near = _without(outlier, tree, distances, near)
+        distances, near = _drop_points(outlier, tree, distances, near)
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
 
 
-def _without(
+def _drop_points(
     outlier: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows of the neighbours of all remaining points, themselves first; the tree holds these points."""
@@ -193,13 +193,13 @@ def measure_noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, floa
     while True:
         distances, near = tree.query(sample, [1 + count * i // HEIGHTS for i in range(1, HEIGHTS + 1)], workers=-1)
         radius = float(np.median(distances[:, -1]))
-        thickness = float(np.quantile(_heights(distinct[near]), FLATTEST)) / radius
+        thickness = float(np.quantile(_measure_heights(distinct[near]), FLATTEST)) / radius
         if thickness < THICKEST or MOST_WIDE * count > len(distinct):
             return radius * float(np.interp(thickness, THICKNESS, NOISES)), radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
 
 
-def _heights(near: np.ndarray) -> np.ndarray:
+def _measure_heights(near: np.ndarray) -> np.ndarray:
     """Height (n,) within which SHARE of the neighbours (n, HEIGHTS, 3) lie of the best plane through three."""
     rng = np.random.default_rng(0)
     best = np.full(len(near), np.inf)
@@ -260,10 +260,10 @@ def _denoise_step(
     """Points (n, 3) after one step, from the points of similar colour around them."""
 
     def spread(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        near, weights = _around(points, tree, radius, AROUND)
+        near, weights = _query_neighbors(points, tree, radius, AROUND)
         weights *= np.exp(-0.5 * np.sum(((color[near] - own[:, None]) / color_sigma) ** 2, axis=-1))
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
-        return _spread(points, tree.data[near], weights)
+        return _find_local_axes(points, tree.data[near], weights)
 
     towards, squared, axes = spread(start)
     squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # least variance of a window of pure noise
@@ -275,21 +275,23 @@ def _denoise_step(
 def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
     """Local means of the columns, over the points around each position."""
     tree = cKDTree(positions)
-    pieces = [_around(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
+    pieces = [_query_neighbors(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
     return {
         name: np.concatenate([np.einsum("nk,nk...->n...", weights, column[near]) for near, weights in pieces])
         for name, column in columns.items()
     }
 
 
-def _around(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _query_neighbors(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows (n, k) of at most `most` neighbours of points (n, 3), and their weights, which sum to 1."""
     distances, near = tree.query(points, list(range(1, min(most, tree.n) + 1)), workers=-1)
     weights = np.exp(-0.5 * (distances / radius) ** 2)
     return near, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
 
 
-def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _find_local_axes(
+    points: np.ndarray, near: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Offset to the mean of the neighbours (n, k, 3) along the axes of their covariance, the eigenvalues, the axes."""
     offset = near - points[:, None]
     mean = (weights[:, None] @ offset)[:, 0]

@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from spnr_jax.kernels.numerics import namespace
+from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
 LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
@@ -172,7 +172,7 @@ class Light:
 
         Exact for multiples of a texel, 5.625 degrees; otherwise texels are interpolated.  The angle may be traced.
         """
-        xp = namespace(degrees)
+        xp = array_namespace(degrees)
         columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
         part = columns - whole

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.numerics import clamp, length, normalize, root
+from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
@@ -98,7 +98,7 @@ def describe_nodes(surfels: Surfels) -> Nodes:
     )
     openness, shown = 2 * jnp.mean(surfels.visibility, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
     traits = jnp.concatenate([surfels.shape_ratios, jnp.stack([surfels.one_sided, openness, shown], axis=1)], axis=1)
-    return Nodes(position, normal, spacing, root(color), traits)
+    return Nodes(position, normal, spacing, safe_sqrt(color), traits)
 
 
 def propose(
@@ -115,8 +115,8 @@ def propose(
     offset = jnp.where(real[..., None], nodes.position[other] - nodes.position[:, None], 0)
     products = jnp.einsum("nai,nbi->nab", offset, offset, precision="highest")
     squared = jnp.diagonal(products, axis1=1, axis2=2)
-    to_end = root(squared[:, :, None] + squared[:, None] - 2 * products)
-    size = root(squared)
+    to_end = safe_sqrt(squared[:, :, None] + squared[:, None] - 2 * products)
+    size = safe_sqrt(squared)
     height = jnp.einsum("nai,ni->na", offset, nodes.normal)
     there = jnp.sum(offset * nodes.normal[other], axis=-1)
     crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
@@ -300,7 +300,7 @@ def describe_edges(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k
     normal, other = nodes.normal[:, None], nodes.normal[around]
     height, from_there = jnp.sum(offset * normal, axis=-1), -jnp.sum(offset * other, axis=-1)
     far = length(offset)
-    beside = root(far**2 - height**2)
+    beside = safe_sqrt(far**2 - height**2)
     unlike = length(nodes.color[around] - nodes.color[:, None])
     coarse = jnp.log(nodes.spacing[around] / spacing)
     parts = [height, from_there, far, jnp.exp(-far), beside, jnp.sum(normal * other, axis=-1), coarse]

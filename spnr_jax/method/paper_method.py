@@ -26,10 +26,10 @@ from scipy.spatial import cKDTree
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
-from spnr_jax.kernels.imaging import WHITE, bilinear
+from spnr_jax.kernels.imaging import WHITE, resize_bilinear
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
-from spnr_jax.kernels.voxels import Path
+from spnr_jax.kernels.voxels import RayPath
 from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsampler
 
@@ -122,7 +122,7 @@ class PaperNetwork(nn.Module):
         features = rendered.features.reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
         if self.config.upsamples:
-            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
+            image = self.upsampler(resize_bilinear(features, camera.height // 2, camera.width // 2))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
             image_lr=features[..., :3].reshape(*views, height, width, 3),
@@ -194,7 +194,7 @@ def _on_one_device(
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rendered)
 
 
-def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> Path:
+def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> RayPath:
     """The sampled part of each ray: its segments near points, or all of it inside the box."""
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
@@ -214,7 +214,7 @@ def locate_samples(rays: Rays, distances: Float[Array, "*rays samples"]) -> Floa
     return clamp(rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :], -1, 1)
 
 
-def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> CompositedRays:
+def march(field: Field, path: RayPath, counts: SamplingConfig, key: Key | None) -> CompositedRays:
     """Renders a field along paths; `key` is one key for all rays, or one per ray."""
     coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
     length, far = path.travelled[..., -1], path.edges[..., -1]

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import WHITE, double_size, mean_of_squares
+from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
     AnyArray,
@@ -283,7 +283,7 @@ def shade(
     if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in inputs.shape[:2]), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(shader_of(params).apply({"params": params["params"]}, inputs[None], doublings))
+        outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, inputs[None], doublings))
     color, alpha = compose_picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):
@@ -291,7 +291,7 @@ def shade(
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 
-def shader_of(params: dict) -> Shader:
+def make_shader(params: dict) -> Shader:
     """The shader network for these weights; its sizes are read from them."""
     weights = params["params"]
     levels = sum(name.startswith("down") for name in weights)
@@ -310,7 +310,7 @@ def paste_window(
     start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
     sums = jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width]
     if side > 1:
-        sums = mean_of_squares(sums, side)
+        sums = average_pool(sums, side)
     acc = sums[..., 3]
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)

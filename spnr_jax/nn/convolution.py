@@ -63,10 +63,10 @@ class Conv(nn.Module):
 
 def _native(x, kernel, stride, padding):
     n = x.ndim - 2
-    return _plain(x, kernel, (stride,) * n, [(padding, padding)] * n)
+    return _general_conv(x, kernel, (stride,) * n, [(padding, padding)] * n)
 
 
-def _plain(x, kernel, stride, padding, x_dilation=None, kernel_dilation=None):
+def _general_conv(x, kernel, stride, padding, x_dilation=None, kernel_dilation=None):
     axes = "DHW"[-(x.ndim - 2) :]
     numbering = f"N{axes}C", f"{axes}IO", f"N{axes}C"
     return lax.conv_general_dilated(x, kernel, stride, padding, x_dilation, kernel_dilation, numbering)
@@ -115,7 +115,7 @@ def _input_gradient(x, kernel, cotangent, stride, padding):
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
     flipped = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
-    return _plain(cotangent, flipped, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
+    return _general_conv(cotangent, flipped, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
@@ -131,17 +131,17 @@ def _kernel_gradient(x, kernel, cotangent, stride, padding):
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
     pads = [(padding, (m - 1) * stride + window - n - padding) for n, m in sizes]
     large = jnp.transpose(cotangent, (1, 2, 0, 3))
-    dk = _plain(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
+    dk = _general_conv(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
     return jnp.transpose(dk, (1, 2, 0, 3))
 
 
 def _conv2d_cpu(x, kernel, stride, padding):
     if kernel.shape[-2] >= MANY_FEATURES:
-        return _columns(x, kernel, stride, padding)
+        return _im2col(x, kernel, stride, padding)
     return _conv2d(x, kernel, stride, padding)
 
 
-def _columns(x, kernel, stride, padding):
+def _im2col(x, kernel, stride, padding):
     """One matrix product of everything that each window sees."""
     columns = jnp.concatenate(list(_windows(_pad(x, padding), kernel.shape[0], stride)), axis=-1)
     return columns @ kernel.reshape(-1, kernel.shape[-1])
@@ -150,7 +150,7 @@ def _columns(x, kernel, stride, padding):
 def _conv3d_cpu(x, kernel, stride, padding):
     taps = kernel.shape[0]
     if x.shape[1] <= 4:
-        return _columns(x, kernel, stride, padding)
+        return _im2col(x, kernel, stride, padding)
     x = jnp.pad(x, ((0, 0), (padding, padding), *[(0, 0)] * 3))
     depth = (x.shape[1] - taps) // stride + 1
     slices = (lax.slice_in_dim(x, k, k + (depth - 1) * stride + 1, stride, axis=1) for k in range(taps))

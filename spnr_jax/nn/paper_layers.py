@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.config import EncoderConfig
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.imaging import WHITE, bilinear, linear_to_srgb
+from spnr_jax.kernels.imaging import WHITE, linear_to_srgb, resize_bilinear
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.voxels import scatter_conv
@@ -69,7 +69,7 @@ class PointNet(nn.Module):
         return nn.Dense(self.num_features, name="out")(x).reshape(*shape, self.num_features)
 
 
-def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+def whiten_materials(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
     """Values around 0 of a material in [0, 1]: of base colours (linear RGB) the sRGB brightness and two axes of hue.
 
     As they are, hues are a twentieth of what varies between points, and a stem of few channels learns to drop them.
@@ -94,8 +94,8 @@ class Encoder(nn.Module):
     def __call__(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object, (z, y, x)."""
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
-        spread = partial(voxels.spread, resolution=self.config.volume_resolution)
-        return self.unet(*jax.vmap(spread)(positions, self.point_features(cloud, train), mask))
+        contribute = partial(voxels.mean_contributions, resolution=self.config.volume_resolution)
+        return self.unet(*jax.vmap(contribute)(positions, self.point_features(cloud, train), mask))
 
     def point_features(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects points features"]:
         """What the PointNet makes of each point."""
@@ -107,7 +107,7 @@ class Encoder(nn.Module):
         materials = [getattr(cloud, name) for name in self.config.materials]
         materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
         if self.config.inputs == "spread":
-            materials = [spread_out(m) for m in materials]
+            materials = [whiten_materials(m) for m in materials]
         inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
         return jnp.where(cloud.mask[..., None], inputs, 0.0)
 
@@ -244,7 +244,7 @@ class Upsampler(nn.Module):
             y = upsample_conv(y, kernel, self.bf16) if i == 2 else conv(y, kernel, bf16=self.bf16)
             y = y + per_feature(self.param(f"bias_{i}", nn.initializers.zeros, (features,)), y)
             y = y if i == 3 else nn.leaky_relu(y, SLOPE)
-        return y + bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])
+        return y + resize_bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])
 
 
 # --- discriminator ----------------------------------------------------------------------------------------------------

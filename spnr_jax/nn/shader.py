@@ -17,8 +17,17 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.imaging import double_size, linear_to_srgb, mean_of_squares, unfold
-from spnr_jax.kernels.numerics import clamp, columns, larger, normalize, one_minus_exp, root, smaller, with_gradient
+from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
+from spnr_jax.kernels.numerics import (
+    clamp,
+    larger,
+    normalize,
+    one_minus_exp,
+    safe_sqrt,
+    smaller,
+    split_columns,
+    with_gradient,
+)
 from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels import lighting
@@ -68,7 +77,7 @@ def compute_inputs(
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
     """The network's inputs, which do not depend on the light, and material and light maps for `compose_picture`."""
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
-    (roughness, metallic, *arriving, reflected, openness), of_surface = map(columns, (first, last))
+    (roughness, metallic, *arriving, reflected, openness), of_surface = map(split_columns, (first, last))
     planarity, linearity, one_sided, materials_unknown, learned, squared = of_surface
     confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
     color = clamp(blended + confidence * clamp(buffer.color - blended, -SHARPEST, SHARPEST), 0, 1)
@@ -87,19 +96,19 @@ def compute_inputs(
     pattern = [jnp.log1p(8 * buffer.sharp_weight)[..., None], clamp(buffer.centre_offset / in_pixels[..., None], -2, 2)]
     inputs = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
     covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
-    contrast = root(squared - jnp.mean(blended, axis=-1) ** 2)  # standard deviation of the blended colours
+    contrast = safe_sqrt(squared - jnp.mean(blended, axis=-1) ** 2)  # standard deviation of the blended colours
     pattern += [materials_unknown[..., None], learned[..., None], contrast[..., None]]
     inputs = jnp.concatenate([drawn * inputs, drawn, *(drawn * x for x in pattern)], axis=-1)
     unshadowed = lighting.irradiance(light, world[0]), lighting.reflect(light, world[1], roughness)
-    maps = [*columns(color), metallic, covered, factor, summand, *arriving]
+    maps = [*split_columns(color), metallic, covered, factor, summand, *arriving]
     return inputs, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
     """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
-    size = root(jnp.sum(buffer.normal**2, axis=-1))
+    size = safe_sqrt(jnp.sum(buffer.normal**2, axis=-1))
     known = size > 1e-3
-    normal = [n / larger(size, 1e-4) for n in columns(buffer.normal)]
+    normal = [n / larger(size, 1e-4) for n in split_columns(buffer.normal)]
     normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
     across, down = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
     right = jnp.broadcast_to(((across - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
@@ -161,7 +170,7 @@ class Double(nn.Module):
     def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
         """Bilinear, plus four new pixels from each, plus two convolutions."""
         features = x.shape[-1]
-        x = double_size(x) + unfold(nn.Dense(4 * features, name="expand")(x), 2)
+        x = double_size(x) + depth_to_space(nn.Dense(4 * features, name="expand")(x), 2)
         y = nn.relu(Conv(features, name="a")(x))
         return x + Conv(features, name="b")(y)
 
@@ -182,7 +191,7 @@ class Shader(nn.Module):
         x = jnp.pad(inputs, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
         skips = []
         for level, features in enumerate(self.widths):
-            x = Conv(features, name=f"in{level}")(mean_of_squares(x, 2) if level else x)
+            x = Conv(features, name=f"in{level}")(average_pool(x, 2) if level else x)
             x = Block(name=f"down{level}")(x)
             skips.append(x)
         for level in reversed(range(len(self.widths) - 1)):

@@ -113,7 +113,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
     return max(RADIUS_FACTORS, key=mean_psnr)
 
 
-def network(variables: dict, config: TrainConfig) -> Method:
+def make_method(variables: dict, config: TrainConfig) -> Method:
     """The method of a trained network; one that uses normals has to estimate them, because the others see none."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
@@ -124,7 +124,7 @@ def network(variables: dict, config: TrainConfig) -> Method:
     return show
 
 
-def floor(name: str, factor: float = 1.0) -> Method:
+def make_floor(name: str, factor: float = 1.0) -> Method:
     """The method of a trivial renderer."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
@@ -237,8 +237,8 @@ def compare(
             "or generate the data set anew with --test-objects N"
         )
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
-    methods = {name: network(one.variables, one.config) for name, one in trained.items()}
-    methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
+    methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
+    methods |= {name: make_floor(name, factors.get(name, 1.0)) for name in FLOORS}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say)
     summary = {
         "methods": summarise(list(scores.values())),

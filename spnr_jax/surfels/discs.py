@@ -17,12 +17,12 @@ from spnr_jax.kernels.numerics import (
     dot,
     larger,
     largest,
-    root,
+    safe_sqrt,
     smaller,
     smallest,
     solve,
+    sum_first,
     sum_products,
-    total,
     unit,
 )
 from spnr_jax.surfels.layers import Constants, Neighborhood, project_on
@@ -36,7 +36,7 @@ def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " 
     """Spacing from the area of the disc that holds a number of neighbors on any layer; in units of the box."""
     count = jnp.minimum(const.raw_neighbors, jnp.sum(hood.real, axis=0) - 1)
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
-    distance = root(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
+    distance = safe_sqrt(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
     several = count > 0  # a single point represents a tenth of the box
     spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, const.least_spacing)
     return jnp.where(several, spacing, const.single_spacing)
@@ -50,10 +50,10 @@ def measure_layer_spacing(
     held = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
     wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * held[-1], 0.5))
     count = jnp.sum(hood.real, axis=0) - 1
-    last = jnp.minimum(total((held < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
+    last = jnp.minimum(sum_first((held < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
     chosen = jnp.arange(others, dtype=count.dtype)[:, None] == last[None]
-    weight, squared = total(jnp.where(chosen, held, 0)), total(jnp.where(chosen, hood.squared[1:], 0))
-    spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * root(squared)
+    weight, squared = sum_first(jnp.where(chosen, held, 0)), sum_first(jnp.where(chosen, hood.squared[1:], 0))
+    spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * safe_sqrt(squared)
     low, high = const.spacing_bounds
     return jnp.where(count > 0, clamp(spacing, low * raw, high * raw), raw)
 
@@ -63,7 +63,7 @@ def smooth_spacing(
 ) -> Float[Array, " block"]:
     """Geometric mean of the spacing over the nearest neighbors on the same layer."""
     weight, near = membership[: const.averaged_neighbors], spacings[: const.averaged_neighbors]
-    return jnp.exp(total(weight * jnp.log(larger(near, const.least_spacing))) / total(weight))
+    return jnp.exp(sum_first(weight * jnp.log(larger(near, const.least_spacing))) / sum_first(weight))
 
 
 def average_rows(
@@ -76,7 +76,7 @@ def average_rows(
         return sums + neighbor[1][:, None] * rows, None
 
     empty = jnp.zeros((weight.shape[1], visibility.shape[1]), weight.dtype)
-    return jax.lax.scan(add, empty, (neighbors, weight / total(weight)[None]))[0]
+    return jax.lax.scan(add, empty, (neighbors, weight / sum_first(weight)[None]))[0]
 
 
 def measure_evenness(
@@ -138,7 +138,7 @@ def find_clip_lines(
 ) -> ClipLines:
     """At a sharp edge, the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
     across, up, facing = (project_on(normals, axis) for axis in axes)
-    flat = root(across**2 + up**2)
+    flat = safe_sqrt(across**2 + up**2)
     clip_lines = (facing < const.edge_cosine) & (flat > const.edge_sine) & (hood.real > 0)
     clip_lines = (
         clip_lines
@@ -169,7 +169,7 @@ def find_rims(
     first = (constant[0] <= nearest[None]) & cut[None]
     turn = jnp.asarray(RIM_ANGLES, ends.dtype)
     direction = [
-        jnp.where(cut, total(jnp.where(first, ways, 0)), of_turn[soonest])
+        jnp.where(cut, sum_first(jnp.where(first, ways, 0)), of_turn[soonest])
         for ways, of_turn in ((clip_lines.across, jnp.cos(turn)), (clip_lines.up, jnp.sin(turn)))
     ]
     right, high = unit(jnp.stack(direction))
@@ -202,8 +202,8 @@ def find_color_edge(
     """
     squared = uv[:, 0] ** 2 + uv[:, 1] ** 2
     weight = membership * jnp.exp(-0.5 / const.color_edge_sigma**2 * squared)
-    weight = jax.lax.optimization_barrier(weight / total(weight)[None])
-    roots, change = root(colors), colors - colors[:1]
+    weight = jax.lax.optimization_barrier(weight / sum_first(weight)[None])
+    roots, change = safe_sqrt(colors), colors - colors[:1]
     roots = roots - roots[:1]
     beyond = _split_colors(weight, jax.lax.stop_gradient(roots))
     plane = jnp.concatenate([jnp.ones_like(uv[:, :1]), uv], axis=1)
@@ -227,7 +227,7 @@ def _split_colors(weight: Float[Array, "k block"], change: Float[Array, "k 3 blo
     """Which neighbors have another color than the point: those closer to the most different color than to its own."""
     differing = jax.lax.optimization_barrier(weight * jnp.sum(change**2, axis=1))
     most = (differing == jnp.max(differing, axis=0)[None]).astype(weight.dtype)
-    axis = total(most[:, None] * change) / total(most)[None]
+    axis = sum_first(most[:, None] * change) / sum_first(most)[None]
     return project_on(change, axis) > 0.5 * dot(axis, axis)[None]
 
 
@@ -272,7 +272,7 @@ def _find_line(
     first = smallest(jnp.where(there & beyond, height, jnp.inf))
     some = first < jnp.inf
     distance = larger(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
-    return direction, distance, total(weight * (beyond != (height > distance[None])))
+    return direction, distance, sum_first(weight * (beyond != (height > distance[None])))
 
 
 def _solve_plane(normal: Float[Array, "3 columns block"], ridge: float) -> Float[Array, "2 sides block"]:

@@ -28,7 +28,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.kernels.numerics import clamp, dot, frame, largest, length, measure_shape, root, smallest, unit
+from spnr_jax.kernels.numerics import (
+    clamp,
+    dot,
+    largest,
+    length,
+    measure_shape,
+    safe_sqrt,
+    smallest,
+    tangent_frame,
+    unit,
+)
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels import discs, layers, sides
 from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS, Constants, Layer, Neighborhood, project_on
@@ -225,7 +235,7 @@ def find_layers(
     Normals are kept.  If `oriented`, they separate the two sides of a thin wall.  With `split_by_color`, a point near
     two surfaces closer than the thickness of a layer is assigned to one of them by its linear color.
     """
-    roots = root(points.color)
+    roots = safe_sqrt(points.color)
 
     def fit(hood: Neighborhood, neighbors: Array, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
         raw_spacing = discs.measure_raw_spacing(hood, const)
@@ -314,7 +324,7 @@ def describe_discs(
         one_sided: Array,
     ) -> dict[str, Array]:
         normals, colors, sides, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
-        axes, spacing = frame(normal), discs.smooth_spacing(weight, spacings[:, 0], const)
+        axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0], const)
         flat = jnp.stack([project_on(hood.offset, axis) for axis in axes[:2]], axis=1)
         wider = discs.bridge_gaps(flat / spacing[None, None], weight, const)
         spacing = spacing * jnp.where(random, wider, 1)

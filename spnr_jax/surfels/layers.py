@@ -20,11 +20,11 @@ from spnr_jax.kernels.numerics import (
     cross,
     dot,
     find_narrowest,
-    frame,
     larger,
     solve,
+    sum_first,
     sum_products,
-    total,
+    tangent_frame,
     unit,
     with_gradient,
 )
@@ -241,7 +241,7 @@ def fit_planes(hood: Neighborhood, spacing: Float[Array, " block"], const: Const
     offset, squared, real, constant, weight = jax.lax.optimization_barrier(jax.lax.stop_gradient(fixed))
 
     def support(normal: Array) -> Array:
-        return total(weight / (1 + (project_on(offset, normal) / const.plane_height) ** 2))
+        return sum_first(weight / (1 + (project_on(offset, normal) / const.plane_height) ** 2))
 
     def compare(best: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
         one, two = pair
@@ -305,7 +305,7 @@ def fit_layers(
     if color_distance is None:
         initial = init(normal, const.first_thickness)
         return _fit_quadric(offset, weight, initial, None, const.thickness_bounds[0], free, const).layer, None
-    two_colors = _smaller_weight(total(weight), total(weight * color_distance)) > const.step_points[0]
+    two_colors = _smaller_weight(sum_first(weight), sum_first(weight * color_distance)) > const.step_points[0]
 
     def fit(normal: Array, with_step: Array) -> tuple[Array, QuadricFit]:
         initial = init(normal, jnp.where(with_step, const.thickness_bounds[1], const.first_thickness))
@@ -343,7 +343,7 @@ def _fit_quadric(
 
     def improve(_: Array, last: tuple[QuadricFit, Array]) -> tuple[QuadricFit, Array]:
         (_, thickness, _), rest = last[0].layer, last[1]
-        axes = frame(last[0].layer.normal)
+        axes = tangent_frame(last[0].layer.normal)
         one, two, up = project_on_axes(offset, axes)
         own = weight * jnp.exp(-0.5 * (rest / thickness[None]) ** 2)
         terms = [one, two, one * one, one * two, two * two, *([] if color_distance is None else [color_distance])]
@@ -356,7 +356,7 @@ def _fit_quadric(
         if color_distance is not None:
             rest = height - solution[5][None] * color_distance
         normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
-        away = total(own * jnp.abs(rest)) / larger(total(own) - 1, 0.5)  # the point itself is at 0
+        away = sum_first(own * jnp.abs(rest)) / larger(sum_first(own) - 1, 0.5)  # the point itself is at 0
         thickness = clamp(const.thickness_per_deviation * away, least_thickness, const.thickness_bounds[1])
         return QuadricFit(Layer(normal, thickness, height), own, sums[:, :-1], solution[-1]), rest
 
@@ -377,7 +377,11 @@ def _test_split(
     step, own = fit.step, fit.weight
     last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
     error = jnp.maximum(solve(fit.sums + _ridge(const, step.dtype), last)[-1, 0], 1e-9)
-    total_weight, other_weight, squares = total(own), total(own * color_distance), total(own * color_distance**2)
+    total_weight, other_weight, squares = (
+        sum_first(own),
+        sum_first(own * color_distance),
+        sum_first(own * color_distance**2),
+    )
     step_alone = jnp.maximum(
         squares - other_weight**2 / jnp.maximum(total_weight, 1e-9), 1e-9
     )  # if the step were the only unknown
@@ -401,7 +405,7 @@ def keep_agreed_splits(
 ) -> Layer:
     """The layers; split ones where enough neighbors of similar color are certain."""
     like = (hood.real * (1 - color_distance))[1:]
-    sure = total(like * certain[1:]) > const.split_share * jnp.maximum(total(like), 1e-6)
+    sure = sum_first(like * certain[1:]) > const.split_share * jnp.maximum(sum_first(like), 1e-6)
     return jax.tree.map(lambda new, old: select(split.possible & sure, new, old), split.layer, layer)
 
 

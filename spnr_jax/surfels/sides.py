@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.kernels.numerics import clamp, dot, total
+from spnr_jax.kernels.numerics import clamp, dot, sum_first
 from spnr_jax.surfels.layers import Constants, Layer, Neighborhood, project_on, weigh_distance, weigh_height
 
 # --- visibility -------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def average_votes(
     """Mean vote of each point and its neighbors on the same layer; opposite normals count with the opposite sign."""
     cosine = project_on(normals, layer.normal)
     weight = weigh_distance(hood, spacing, const) * weigh_height(layer) * cosine**2
-    return total(weight * jnp.sign(cosine) * votes) / jnp.maximum(total(weight), 1e-6)
+    return sum_first(weight * jnp.sign(cosine) * votes) / jnp.maximum(sum_first(weight), 1e-6)
 
 
 def vote_by_thin_walls(
@@ -160,7 +160,7 @@ def vote_by_thin_walls(
     thin = oriented & (layer.thickness <= const.thickness_bounds[0])
     thickness = jnp.where(thin, const.split_thickness, layer.thickness)
     outward = layer.height / thickness[None]
-    above, below = total(wall * (outward > const.other_layer)), total(wall * (outward < -const.other_layer))
+    above, below = sum_first(wall * (outward > const.other_layer)), sum_first(wall * (outward < -const.other_layer))
     return const.thin_wall_weight * (below - above) / (above + below + const.vote_ridge)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
-from spnr_jax.kernels.numerics import clamp, columns, larger, one_minus_exp, root, smaller, smoothstep
+from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep, split_columns
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 # --- entries ----------------------------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
         )
     )
     normal = numerics.rotate_columns(rotation, surfels.normal)
-    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(root(x * x + y * y + z * z), NEAR_PLANE)
+    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(safe_sqrt(x * x + y * y + z * z), NEAR_PLANE)
     facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
     ahead = larger(-z, NEAR_PLANE)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
@@ -177,7 +177,7 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     rotation = camera.cam_to_world[:, :3]
     rim_tangent = numerics.rotate_columns(rotation, surfels.rim_tangent)
     rim_bitangent = _cross(foot.normal, rim_tangent)
-    rim_distances = tuple(columns(jnp.asarray(surfels.rim_distances)))
+    rim_distances = tuple(split_columns(jnp.asarray(surfels.rim_distances)))
     foot, begin, point, rim_tangent, rim_bitangent, rim_distances = jax.lax.optimization_barrier(
         (foot, end - covered, point, rim_tangent, rim_bitangent, rim_distances)
     )
@@ -272,7 +272,7 @@ def blend(
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
     of_pixel = of_slot[slot_of].reshape(height, width, -1)
-    return _normalise_sums(columns(of_pixel), attributes.shape[1], camera)
+    return _normalise_sums(split_columns(of_pixel), attributes.shape[1], camera)
 
 
 def count_covered_pixels(entries: Entries) -> Int[Array, ""]:
@@ -449,7 +449,7 @@ def _normalise_sums(sums: list[Array], features: int, camera: Camera) -> GBuffer
         opacity=smaller(blend_weight, 1),
         coverage=coverage,
         depth=depth,
-        depth_deviation=root(squared * inverse),
+        depth_deviation=safe_sqrt(squared * inverse),
         log_spacing=log_spacing,
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),

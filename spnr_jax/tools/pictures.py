@@ -35,7 +35,7 @@ from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
-from spnr_jax.surfels.lighting import background
+from spnr_jax.surfels.lighting import look_up_background
 from spnr_jax.surfels.skies import sun
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.surfaces import surface_depth
@@ -73,7 +73,7 @@ def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Lig
 def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
     """The light's map as a camera sees it, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
-    return linear_to_srgb(jnp.minimum(jnp.stack(background(light, towards), axis=-1), 1))
+    return linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1))
 
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side

@@ -56,7 +56,7 @@ def new_token() -> str:
     return secrets.token_urlsafe(LENGTH)
 
 
-def admit(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
+def check_request(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
     """The request with the path behind the token, or why it is refused."""
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
@@ -93,7 +93,7 @@ def require_token(token: str, reached_at: str | None = None) -> Iterator[list[An
 
     def serve(*arguments: Any, process_request: RequestHook | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
-            answer = admit(request, token, reached_at)
+            answer = check_request(request, token, reached_at)
             if isinstance(answer, Response) or process_request is None:
                 return answer if isinstance(answer, Response) else None
             return process_request(connection, answer)

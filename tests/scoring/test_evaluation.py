@@ -26,8 +26,8 @@ FACTORS = {"splat": 1.5, "nearest": 0.75}
 
 def methods():
     variables = optimisation.averaged_variables(checkpoint.restore(tiny_untrained.run(), CONFIG))
-    trivial = {name: evaluation.floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
-    return {"paper": evaluation.network(variables, CONFIG), **trivial}
+    trivial = {name: evaluation.make_floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
+    return {"paper": evaluation.make_method(variables, CONFIG), **trivial}
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
 
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
-    asked = {"white": evaluation.floor("white")}
+    asked = {"white": evaluation.make_floor("white")}
     result = evaluation.evaluate_object(asked, CONFIG, data_sets.read_object(tiny_dataset.dataset(), NAMES[0]))
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
