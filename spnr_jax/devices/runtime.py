@@ -114,7 +114,7 @@ def _start(function: Callable, state: Any, task: Any, processes: list) -> connec
     """The pipe to a new worker, which has begun with a task."""
     ours, theirs = PROCESSES.Pipe()
     processes.append(PROCESSES.Process(target=_work, args=(theirs, function, state), daemon=True))
-    with _ready_for_children():
+    with _prepare_children():
         processes[-1].start()
     theirs.close()  # so that the pipe ends with the worker
     _send(ours, task)
@@ -128,7 +128,7 @@ def _send(pipe: connection.Connection, task: Any) -> None:
 
 
 @contextmanager
-def _ready_for_children() -> Iterator[None]:
+def _prepare_children() -> Iterator[None]:
     """What is started meanwhile has one thread, and never sees Ctrl-C, which reaches every process of a terminal."""
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -4,11 +4,11 @@
     place      middle of a pair's curved edge (PN triangles, Vlachos et al. 2001), and a local frame there
     predict    graph convolutions over the points, then a PointNet over the points around each candidate, in its frame:
                offset to the surface, normal, probability that the point exists, and material weights
-    choose     keep the likely children that are not too close to better ones
+    select     keep the likely points that are not too close to better ones
 
 The network is rotation-equivariant: lengths are in spacings, vectors in frames that rotate with the cloud.  The
-neighbors come from the host.  The choice of pairs, of the points around them and of children has no gradient;
-positions, normals and materials are differentiable.  A *child* is a learned point; an *end* is a point of a pair.
+neighbors come from the host.  The choice of pairs, of the points around them and of the kept points has no gradient;
+positions, normals and materials are differentiable.  An *end* is a point of a pair.
 """
 
 import dataclasses
@@ -26,11 +26,11 @@ from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 
-MOST_POINTS = 32768  # a cloud of more points gets no children
-SPARSE = 8192  # points: up to here children are added everywhere; in larger clouds, only at rims and on curved parts
+MOST_POINTS = 32768  # a cloud of more points gets no learned points
+SPARSE = 8192  # points: up to here points are added everywhere; in larger clouds, only at rims and on curves
 BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
 CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places
-NUM_NEAREST = 16  # nearest points from which a child is predicted
+NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
 ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
 LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
@@ -39,14 +39,14 @@ TANGENT_DIRECTIONS = (
 )
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
 OPEN_DISTANCE = 0.5  # spacings from a point to its open place
-LEAST_DISTANCE = 0.2  # spacings: a child closer than this to a measured point or to a better child is dropped
+LEAST_DISTANCE = 0.2  # spacings: a learned point closer than this to a measured or a better learned one is dropped
 NORMAL_PENALTY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to CLOSEST
 LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther away is no better
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
 EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
-LEAST_PROBABILITY = 0.55  # probability above which a child is kept
+LEAST_PROBABILITY = 0.55  # probability above which a learned point is kept
 
 
 class Nodes(NamedTuple):
@@ -76,7 +76,7 @@ class Candidates(NamedTuple):
 
 
 class LearnedPoints(NamedTuple):
-    """A child of each candidate: `offset` from its middle in its frame, log odds that it exists, material weights."""
+    """The point predicted for each candidate: `offset` from the middle in its frame, logit of existence, weights."""
 
     position: Float[Array, "m 3"]
     offset: Float[Array, "m 3"]
@@ -213,7 +213,7 @@ class GraphConvolution(nn.Module):
 
 
 class Proposal(nn.Module):
-    """Predicts children: a PointNet over the points around each candidate, in the candidate's frame."""
+    """Predicts points: a PointNet over the points around each candidate, in the candidate's frame."""
 
     @nn.compact
     def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], candidates: Candidates) -> LearnedPoints:
@@ -257,7 +257,7 @@ def init(key: Key, nodes: Nodes, candidates: Candidates) -> dict:
 
 
 def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], candidates: Candidates) -> LearnedPoints:
-    """The children of the candidates: graph convolutions, then a PointNet for each candidate, in blocks."""
+    """The points predicted for the candidates: graph convolutions, then a PointNet for each candidate, in blocks."""
     hidden: Any = nn.Dense(FEATURES).apply({"params": params["point"]}, nodes.traits)
     around = neighbors[:, 1:]
     edges = describe_edges(nodes, around)
@@ -343,9 +343,9 @@ def weigh_rows(weights: Float[Array, "m k"], values: Float[Array, "m k ..."]) ->
 def select_points(
     nodes: Nodes, neighbors: Int[Array, "n 20"], candidates: Candidates, learned: LearnedPoints
 ) -> Bool[Array, " m"]:
-    """Which children are kept: likely ones that are not too close to each other or to a measured point.
+    """Which predicted points are kept: likely ones that are not too close to each other or to a measured point.
 
-    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the children
+    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the points
     that beat all their rivals (maximal independent set, Luby 1986), so the order of points does not matter.
     """
     count = len(neighbors)
