@@ -29,6 +29,7 @@ from experiments.comparison import contenders, results_folder, scores
 from experiments.comparison.contenders import Method
 from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
+from experiments.comparison.sharpness import WELL_INSIDE, measure_sharpness
 from experiments.comparison.study_objects import cut
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
@@ -39,7 +40,6 @@ from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.picture_scores import WELL_INSIDE, sharpness
 from spnr_jax.scoring.report import Cell, Table, number
 
 COLUMNS = {
@@ -156,7 +156,7 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True):
         reference = rgba.astype(np.float32) / 255
         right = under_true_opacity(np.asarray(image), np.asarray(opacity), reference)
-        found.append(sharpness(right, reference[..., 3], reference))
+        found.append(measure_sharpness(right, reference[..., 3], reference))
     return {
         "psnr_true_opacity": [one.psnr for one in found],
         "inside_true_opacity": [one.psnr_inside for one in found],

@@ -16,7 +16,7 @@ import numpy as np
 from spnr_jax.formats.images import depth_image, png_url, template, write_whole
 from spnr_jax.methods import label_of, to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
-from spnr_jax.scoring.picture_scores import NO_LPIPS, interval
+from spnr_jax.scoring.picture_scores import NO_LPIPS
 
 OTHERS = {  # what is shown beside the methods that are trained -> its name in tables and pictures
     "ours": "Ours",
@@ -76,18 +76,6 @@ def number(
     form = f"{sign},.{decimals}f"
     ends = [f"[{', '.join(f'{factor * end:{form}}' for end in interval)}]"] if interval else []
     return Cell(f"{factor * value:{form}}", (*ends, *more), best)
-
-
-def mean_row(
-    label: str, objects: Sequence[Sequence[Any]] | np.ndarray, decimals: Sequence[int], sign: str = ""
-) -> tuple[str, tuple[Cell, ...]]:
-    """A row of means of columns over objects, with intervals; None and NaN are left out."""
-    cells = []
-    for column, digits in zip(np.array(objects, float).T, decimals, strict=True):
-        known = column[~np.isnan(column)]
-        mean = float(known.mean()) if len(known) else None
-        cells.append(number(mean, digits, interval([np.array([x]) for x in known]) if len(known) else None, sign=sign))
-    return label, tuple(cells)
 
 
 def head(metric: str) -> str:
