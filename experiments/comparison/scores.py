@@ -22,8 +22,8 @@ from tqdm import tqdm
 from experiments.comparison import figures
 from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import load_or_make
-from experiments.comparison.sharpness import measure_sharpness
 from experiments.comparison.study_objects import cut
+from experiments.comparison.view_scores import measure_sharpness
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData

@@ -23,7 +23,7 @@ from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from experiments import entry_point
 from experiments.comparison.contenders import draw_volume
-from experiments.comparison.sharpness import measure_sharpness
+from experiments.comparison.view_scores import measure_sharpness
 from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets

@@ -29,8 +29,8 @@ from experiments.comparison import contenders, results_folder, scores
 from experiments.comparison.contenders import Method
 from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
-from experiments.comparison.sharpness import WELL_INSIDE, measure_sharpness
 from experiments.comparison.study_objects import cut
+from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images

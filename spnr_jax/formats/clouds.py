@@ -228,7 +228,7 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
 
 def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
+    from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
     from spnr_jax.formats.surface_points import bounding_box, sample_surface
 
     cut, report = how.cut, how.report
