@@ -27,20 +27,18 @@ from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
-SPARSE = 8192  # points: up to here points are added everywhere; in larger clouds, only at rims and on curves
+SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims and on curves
 BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
 CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places
 NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
 ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
 LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
-TANGENT_DIRECTIONS = (
-    6  # directions in each tangent plane that are tested for openness; the first points to the nearest neighbor
-)
+TANGENT_DIRECTIONS = 6  # tested for openness in each tangent plane; the first points to the nearest neighbor
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
 OPEN_DISTANCE = 0.5  # spacings from a point to its open place
 LEAST_DISTANCE = 0.2  # spacings: a learned point closer than this to a measured or a better learned one is dropped
-NORMAL_PENALTY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to CLOSEST
+NORMAL_PENALTY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to LEAST_DISTANCE
 LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther away is no better
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
@@ -356,7 +354,7 @@ def select_points(
     closest = LEAST_DISTANCE * scale.reshape(count, CANDIDATES, 1)
 
     def compare(others: Array, facing: Array) -> Array:
-        """Squared distances over CLOSEST squared, plus a term for different normals; below 1 is too close."""
+        """Squared distances over LEAST_DISTANCE squared, plus a term for different normals; below 1 is too close."""
         far = jnp.sum((others[:, None] - position[:, :, None]) ** 2, axis=-1)
         unlike = 1 - jnp.einsum("nki,nci->nck", facing, normal, precision="highest")
         return far / closest**2 + NORMAL_PENALTY * unlike

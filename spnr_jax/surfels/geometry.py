@@ -166,8 +166,8 @@ def map_blocks(
 ) -> Any:
     """The results of `work` for all blocks of points, concatenated.
 
-    `work` receives the neighborhoods of a block (with these columns of the neighbors), the neighbors' indices, and the
-    block's part of the `own` arrays (..., points).  All values of a block travel in one array.  For the gradient, only
+    `work` receives the neighborhoods of a block (with these columns of the neighbors) and the block's part of the `own`
+    arrays (..., points).  All values of a block travel in one array.  For the gradient, only
     the inputs of a block are kept, and the block is computed again.
     """
     count = points.mask.shape[0]
@@ -178,7 +178,7 @@ def map_blocks(
 
     def compute(neighbors: Array, packed: Array) -> Array:
         place, values = _unpack(packed, (points.position, own))
-        out = work(layers.gather_neighborhoods(neighbors, place, table), neighbors, *values)
+        out = work(layers.gather_neighborhoods(neighbors, place, table), *values)
         forms.append(out)
         return _pack(out)
 
@@ -237,7 +237,7 @@ def find_layers(
     """
     roots = safe_sqrt(points.color)
 
-    def fit(hood: Neighborhood, neighbors: Array, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
+    def fit(hood: Neighborhood, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
         raw_spacing = discs.measure_raw_spacing(hood, const)
         weight = layers.weigh_distance(hood, raw_spacing, const)
         first, fixed = layers.init_normals(hood, raw_spacing, *own, const=const)
@@ -251,7 +251,7 @@ def find_layers(
     if split is None:
         return raw_spacing, layer
 
-    def keep_agreed(hood: Neighborhood, neighbors: Array, layer: Layer, split: layers.SplitLayer) -> Layer:
+    def keep_agreed(hood: Neighborhood, layer: Layer, split: layers.SplitLayer) -> Layer:
         color_distance = layers.measure_color_distance(hood, hood.columns[:, :3], const)
         return layers.keep_agreed_splits(hood, layer, split, color_distance, hood.columns[:, 3], const)
 
@@ -289,7 +289,7 @@ def orient_layers(
     front, back = sides.sum_visibility(layer.normal, visibility)
 
     def vote(votes: Array, first: Array) -> tuple[Array, None]:
-        def combine(hood: Neighborhood, neighbors: Array, raw_spacing: Array, layer: Layer, oriented: Array) -> Array:
+        def combine(hood: Neighborhood, raw_spacing: Array, layer: Layer, oriented: Array) -> Array:
             normals, votes = hood.columns[:, :3], hood.columns[:, 3]
             walls = sides.vote_by_thin_walls(hood, layer, raw_spacing, normals, oriented, const)
             return sides.average_votes(hood, layer, raw_spacing, normals, votes, const) + first * walls
@@ -316,7 +316,6 @@ def describe_discs(
 
     def work(
         hood: Neighborhood,
-        neighbors: Array,
         raw_spacing: Array,
         layer: Layer,
         weight: Array,
@@ -359,10 +358,8 @@ def average_visibility(
     def one(block: tuple[Array, Array]) -> Array:
         return discs.average_rows(*block, rows)
 
-    near = (
-        _split(points.neighbors[: const.averaged_neighbors], size, -1),
-        _split(weight[: const.averaged_neighbors], size, 1),
-    )
+    count = const.averaged_neighbors
+    near = _split(points.neighbors[:count], size, -1), _split(weight[:count], size, 1)
     return jax.lax.map(one, near).reshape(-1, len(visibility))[: len(points.mask)].T
 
 
@@ -377,7 +374,7 @@ def measure_spacings(
     """Spacings, weights of the neighbors as members of the same layer, and whether the points are random (not even)."""
 
     def weigh(
-        hood: Neighborhood, neighbors: Array, raw_spacing: Array, layer: Layer, normal: Array, one_sided: Array
+        hood: Neighborhood, raw_spacing: Array, layer: Layer, normal: Array, one_sided: Array
     ) -> tuple[Array, Array, Array]:
         weight = layers.weigh_layer(hood, layer, normal, one_sided, hood.columns, const)
         spacing = discs.measure_layer_spacing(hood, weight, raw_spacing, const)
@@ -385,11 +382,8 @@ def measure_spacings(
 
     layer_spacing, weight, evenness = map_blocks(weigh, points, normal, const, raw_spacing, layer, normal, one_sided)
     random = median(evenness, points.mask) < const.even_distance
-    return (
-        jnp.where(random, layer_spacing, jnp.minimum(layer_spacing, const.even_spacing_bound * raw_spacing)),
-        weight,
-        random,
-    )
+    bounded = jnp.minimum(layer_spacing, const.even_spacing_bound * raw_spacing)
+    return jnp.where(random, layer_spacing, bounded), weight, random
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------

@@ -175,12 +175,10 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=capacity)
     # gather whole columns once instead of at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
-    rim_tangent = numerics.rotate_columns(rotation, surfels.rim_tangent)
-    rim_bitangent = _cross(foot.normal, rim_tangent)
-    rim_distances = tuple(split_columns(jnp.asarray(surfels.rim_distances)))
-    foot, begin, point, rim_tangent, rim_bitangent, rim_distances = jax.lax.optimization_barrier(
-        (foot, end - covered, point, rim_tangent, rim_bitangent, rim_distances)
-    )
+    rim = numerics.rotate_columns(rotation, surfels.rim_tangent)
+    side = _cross(foot.normal, rim)
+    far = tuple(split_columns(jnp.asarray(surfels.rim_distances)))
+    foot, begin, point, rim, side, far = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, far))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
     index = jnp.arange(capacity, dtype=jnp.int32)
@@ -195,8 +193,8 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     ray_depth = clamp((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
     there = [RADIUS / radius * x for x in (ray_depth * right - x, ray_depth * up - y, -ray_depth - z)]  # in spacings
     in_plane = _dot(there, there) / RADIUS**2
-    along, across = _dot(there, [c[point] for c in rim_tangent]), _dot(there, [c[point] for c in rim_bitangent])
-    ends = [r[point] - x for r, x in zip(rim_distances, (along, -along, across, -across), strict=True)]
+    along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
+    ends = [r[point] - x for r, x in zip(far, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / MIN_RADIUS**2
     cut = larger(cut - in_plane, RIM_SKIRT * (1 - in_plane))
@@ -360,27 +358,20 @@ def _pull_back_blend_weights(
     by_weight, by_transmittance = cotangents
     tau_before, tau_layer = _optical_depths(*primals)
     transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_layer)
-    by_tau_layer = by_weight * (tau * transmittance * slope)
-    by_tau_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
-    by_tau = (
-        by_weight * (transmittance * mean)
-        + by_tau_layer
-        + jnp.matmul(_mark_far_in_front(len(tau)).T, by_tau_before, precision="highest")
-    )
+    by_layer = by_weight * (tau * transmittance * slope)
+    by_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
+    by_tau = by_weight * (transmittance * mean) + by_layer
+    by_tau += jnp.matmul(_far_in_front(len(tau)).T, by_before, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
-    by_tau_layer, by_tau_before = map(
-        jax.lax.optimization_barrier, (by_tau_layer, by_tau_before)
-    )  # one would be linear in all
-    known = tau, depth, spacing, by_tau_layer, by_tau_before
+    by_layer, by_before = map(jax.lax.optimization_barrier, (by_layer, by_before))  # one would be linear in all
+    known = tau, depth, spacing, by_layer, by_before
     for step, (other_tau, *places, other_by_layer, other_by_before) in _shift_lists(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
         gap, middle = _measure_gap(step, depth, spacing, *places)
         x = clamp(gap - 1, 0, 1)
         apart, slope = x * x * (3 - 2 * x), 6 * x * (1 - x)
         by_tau += other_by_layer * (1 - apart) + (other_by_before * apart if step > 0 else 0)
-        through = (
-            tau * other_by_before if step > 0 else other_tau * by_tau_before
-        )  # the front entry occludes the one behind
-        by_gap = slope * (through - other_tau * by_tau_layer - tau * other_by_layer)
+        through = tau * other_by_before if step > 0 else other_tau * by_before  # the front entry occludes the other
+        by_gap = slope * (through - other_tau * by_layer - tau * other_by_layer)
         by_depth += np.sign(-step) * by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
     return by_tau, by_depth, by_spacing
@@ -391,7 +382,7 @@ _blend_weights = numerics.with_gradient(_plain_blend_weights, _pull_back_blend_w
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
     """Optical depth in front of each entry's layer, and that of the layer."""
-    tau_before, tau_layer = jnp.matmul(_mark_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
+    tau_before, tau_layer = jnp.matmul(_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
     for step, (other_tau, *places) in _shift_lists((tau, depth, spacing), (0.0, 0.0, 1.0)):
         apart = smoothstep(_measure_gap(step, depth, spacing, *places)[0] - 1)
         tau_layer += other_tau * (1 - apart)
@@ -400,7 +391,7 @@ def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Ar
     return tau_before, tau_layer
 
 
-def _mark_far_in_front(length: int) -> Array:
+def _far_in_front(length: int) -> Array:
     """1 where the column's entry is so far in front of the row's entry in the list that it occludes it untested."""
     return jnp.tril(jnp.ones((length, length)), -COMPARED - 1)
 
@@ -440,9 +431,9 @@ def _normalise_sums(sums: list[Array], features: int, camera: Camera) -> GBuffer
     blend_weight, coverage, depth, squared = rest
     inverse = 1 / larger(blend_weight, LEAST_OPACITY)
     *wide, log_spacing = (x * inverse for x in wide)
-    *color, column, row, sharp_weight = narrow
-    has_color = sharp_weight > LEAST_WEIGHT
-    inverse_sharp = jnp.where(has_color, 1 / jnp.where(has_color, sharp_weight, 1), 0)
+    *color, column, row, sharp = narrow
+    has_color = sharp > LEAST_WEIGHT
+    inverse_sharp = jnp.where(has_color, 1 / jnp.where(has_color, sharp, 1), 0)
     middles = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
     offsets = (column, middles[0]), (row, middles[1])
     return GBuffer(
@@ -454,8 +445,6 @@ def _normalise_sums(sums: list[Array], features: int, camera: Camera) -> GBuffer
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),
         attributes=jnp.stack(wide[:features], axis=-1),
-        sharp_weight=sharp_weight,
-        centre_offset=jnp.stack(
-            [(total - sharp_weight * pixels) / (sharp_weight + FADE) for total, pixels in offsets], axis=-1
-        ),
+        sharp_weight=sharp,
+        centre_offset=jnp.stack([(total - sharp * pixels) / (sharp + FADE) for total, pixels in offsets], axis=-1),
     )
