@@ -88,21 +88,23 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
-    shader, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
+    weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     common = {
         of.resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == of.resolution)
         for of in planned
     }
 
-    def one(of: PlannedView, whole: Camera) -> Rendering:
-        drawn = draw_planned(shader, volume, of, common[of.resolution])
+    def draw(view: PlannedView, whole: Camera) -> Rendering:
+        if view.needed.entries:
+            plan = surfel_renderer.round_sizes(common[view.resolution], *view.resolution)
+            window_buffer = _rasterize(volume.scene, view.camera, view.light, plan=plan)
+            drawn = _shade(weights, volume.scene, view.camera, view.light, window_buffer, plan=plan)
+        else:
+            drawn = _leave_empty(volume.scene, view.camera)
         return drawn if render_scale == 1 else _enlarge(drawn, whole.height, whole.width)
 
-    if len(views) == 1:
-        yield one(planned[0], views[0])
-    else:
-        yield from two_at_a_time(lambda both: one(*both), zip(planned, views, strict=True))
+    yield from two_at_a_time(lambda both: draw(*both), zip(planned, views, strict=True))
 
 
 def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_scale: float) -> PlannedView:
@@ -114,15 +116,6 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
     doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
     needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
     return PlannedView(camera, light or room_light(), (doublings, side), needed)
-
-
-def draw_planned(variables: dict | None, volume: Volume, planned: PlannedView, sizes: Sizes) -> Rendering:
-    """A view drawn with arrays of these sizes."""
-    if not planned.needed.entries:
-        return _leave_empty(volume.scene, planned.camera)
-    plan = surfel_renderer.round_sizes(sizes, *planned.resolution)
-    window_buffer = _rasterize(volume.scene, planned.camera, planned.light, plan=plan)
-    return _shade(variables, volume.scene, planned.camera, planned.light, window_buffer, plan=plan)
 
 
 @partial(CachedProgram, returns=(SurfelScene, Surfels), options=QUICKEST)

@@ -60,7 +60,7 @@ class PointNet(nn.Module):
     def __call__(
         self, x: Float[Array, "*batch points channels"], mask: Bool[Array, "*batch points"], train: bool
     ) -> Float[Array, "*batch points features"]:
-        """Features of every point; masked points do not touch the statistics of a batch."""
+        """Features of every point; masked points do not affect the statistics of a batch."""
         # one long axis of points: XLA's CPU gradient of a product that sums over several axes takes four times as long
         shape, x, mask = mask.shape, x.reshape(-1, x.shape[-1]), mask.reshape(-1)
         for i, width in enumerate(self.widths):
@@ -70,9 +70,9 @@ class PointNet(nn.Module):
 
 
 def whiten_materials(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
-    """Values around 0 of a material in [0, 1]: of base colours (linear RGB) the sRGB brightness and two axes of hue.
+    """A material in [0, 1], centred at 0; base colours (linear RGB) become sRGB brightness and two axes of hue.
 
-    As they are, hues are a twentieth of what varies between points, and a stem of few channels learns to drop them.
+    Unchanged, hues are a twentieth of the variance between points, and a stem with few channels learns to drop them.
     """
     if material.shape[-1] == 1:
         return 2 * material - 1
@@ -80,7 +80,7 @@ def whiten_materials(material: Float[Array, "*batch channels"]) -> Float[Array, 
 
 
 class Encoder(nn.Module):
-    """The paper's network begins with it; with bf16 the convolutions of the U-Net run in bfloat16."""
+    """PointNet, scatter and 3D U-Net; with bf16, the convolutions of the U-Net run in bfloat16."""
 
     config: EncoderConfig
     bf16: bool = False
@@ -98,7 +98,7 @@ class Encoder(nn.Module):
         return self.unet(*jax.vmap(contribute)(positions, self.point_features(cloud, train), mask))
 
     def point_features(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects points features"]:
-        """What the PointNet makes of each point."""
+        """Features of each point from the PointNet."""
         return self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
@@ -164,7 +164,7 @@ class UNet3D(nn.Module):
     def __call__(
         self, rows: Int[Array, "objects points"], values: Float[Array, "objects points channels"]
     ) -> Float[Array, "objects d d d features"]:
-        """Feature volume of each object from its scattered points (`voxels.scatter_conv` says in which form)."""
+        """Feature volume of each object from its scattered points (in the form of `voxels.scatter_conv`)."""
         x = Stem(self.base_width, self.resolution, self.num_groups, name="stem")(rows, values)
         skips, width = [], self.base_width
         for i in range(self.num_stages):
@@ -198,7 +198,7 @@ class RadianceField(nn.Module):
         self.feature_bias = self.param("feature_bias", nn.initializers.zeros, (self.num_features - 3,))
 
     def view(self, directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays features"]:
-        """What the view direction adds to each feature: nothing if the field does not see it."""
+        """Contribution of the view direction to each feature; 0 if the field does not see it."""
         if not self.sees_direction:
             return jnp.zeros((*directions.shape[:-1], self.num_features), directions.dtype)
         return self.direction(encode_direction(directions, self.direction_frequencies))
@@ -206,7 +206,7 @@ class RadianceField(nn.Module):
     def __call__(
         self, x: Float[Array, "*rays samples channels"], view: Float[Array, "*rays features"]
     ) -> tuple[Float[Array, "*rays samples"], tuple[Array, Array]]:
-        """Density, and what is emitted at each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
+        """Density, and the emitted values of each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
         # one long axis of samples: XLA's CPU gradient of a product that sums over several axes takes four times as long
         hidden = softplus(self.hidden(x.reshape(-1, x.shape[-1])))
         out = self.head(hidden).reshape(*x.shape[:-1], 4)
@@ -216,7 +216,7 @@ class RadianceField(nn.Module):
     def decode(
         self, emitted: tuple[Array, Array], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
     ) -> Float[Array, "*rays features"]:
-        """Features of a ray, RGB on white and the rest on zero, from what is composited and its opacity."""
+        """Features of a ray, RGB on white and the rest on zero, from the composited values and the opacity."""
         rgb, hidden = emitted
         rest = self.features(hidden) + acc[..., None] * (per_feature(self.feature_bias, view) + view[..., 3:])
         return jnp.concatenate([rgb + (1 - acc[..., None]) * WHITE, rest], axis=-1)
@@ -264,7 +264,7 @@ class Discriminator(nn.Module):
         condition: Float[Array, "batch height width 3"],
         condition_mask: Bool[Array, "batch height width"],
     ) -> Float[Array, "batch rows columns 1"]:
-        """Logit of each patch: positive for what looks like a reference image."""
+        """Logit of each patch: positive for patches that look like a reference image."""
         x = jnp.concatenate([image, condition, condition_mask[..., None].astype(image.dtype)], axis=-1)
         widths = [self.width * 2**i for i in range(4)]
         for i, features in enumerate([*widths, 1]):

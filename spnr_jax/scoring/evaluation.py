@@ -1,4 +1,4 @@
-"""How good methods are on a split of a data set: a network beside the trivial renderers that every table shows.
+"""Scores of methods on a split of a data set: a network beside the trivial renderers that every table shows.
 
 A method is a function that shows a cloud to cameras (`Method`); all of them see the same points and cameras, and are
 scored by the same metrics.
@@ -43,7 +43,7 @@ BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per vi
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """What a method shows of one object: image (views, height, width, 3), opacity and depth (views, h, w).
+    """Renderings of one object by a method: image (views, height, width, 3), opacity and depth (views, h, w).
 
     Opacity and depth may be smaller than the image; the trivial renderers have no depth.
     """
@@ -74,7 +74,7 @@ def _score(
     alpha: Array,
     mask: Array,
 ) -> dict[str, Array]:
-    """The metrics of JAX of one object's views."""
+    """Metrics of one object's views that are computed by JAX."""
     return {
         "psnr": metrics.psnr(image, reference),
         "ssim": metrics.ssim(image, reference),
@@ -114,7 +114,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
 
 
 def make_method(variables: dict, config: TrainConfig) -> Method:
-    """The method of a trained network; one that uses normals has to estimate them, because the others see none."""
+    """The method of a trained network; normals are removed from the clouds, because other methods get none."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
         cloud = dataclasses.replace(cloud, normals=None)
@@ -168,7 +168,7 @@ def to_numpy(pictures: Pictures) -> Pictures:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What `spnr evaluate` writes: the metrics.json content, and results of the objects for the gallery."""
+    """The output of `spnr evaluate`: content of metrics.json, and results of the objects in the gallery."""
 
     config: TrainConfig
     summary: dict
@@ -176,12 +176,12 @@ class Evaluation:
 
 
 def pick_evenly(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """So many of the names, evenly from the first to the last."""
+    """`count` of the names, evenly spaced from the first to the last."""
     return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
 
 
 def median_view(psnr: np.ndarray) -> int:
-    """The view with the median PSNR, which neither flatters nor slanders."""
+    """The view with the median PSNR, as the most typical one."""
     return int(np.argsort(psnr)[len(psnr) // 2])
 
 
@@ -193,7 +193,7 @@ def score_methods(
     gallery_objects: int,
     say: Callable[[str], None],
 ) -> tuple[dict[str, dict[str, Scores]], list[ObjectResult]]:
-    """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
+    """Scores of every object by name, and the results of a few objects for the gallery."""
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
     shown = pick_evenly(names, gallery_objects)
@@ -214,7 +214,7 @@ def evaluate(
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
 ) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split, named by what it is."""
+    """Scores of a run's newest checkpoint on a split, under the name of its method."""
     trained = read_trained(run, say)
     return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say)
 
@@ -226,7 +226,7 @@ def compare(
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
 ) -> Evaluation:
-    """Scores of networks on a split, all with the points of the first, which the others are subtracted from."""
+    """Scores of networks on a split, all with the same points; differences are the first minus each other."""
     first = next(iter(trained))
     config = trained[first].config
     names = dataset.splits[split]
@@ -312,7 +312,7 @@ def measure_nearest_distance(cloud: PointCloud) -> float:
 
 
 def _shade_first(cloud, camera, order):
-    """Image and opacity where each ray shows the point that `order`(direction) puts first; infinity is a miss."""
+    """Image and opacity; each ray shows the point with the least `order`(direction); infinity is a miss."""
     directions = camera_rays(camera).directions.reshape(-1, 3)
 
     def first(direction):
@@ -327,5 +327,5 @@ def _shade_first(cloud, camera, order):
 
 
 def _map_blocks(function, inputs, num_points):
-    """`function` of every row of `inputs`, so many rows at once that BLOCK pairs of row and point are in memory."""
+    """`function` of every row of `inputs`; as many rows at once as give BLOCK pairs of row and point."""
     return jax.lax.map(function, inputs, batch_size=max(1, BLOCK // num_points))

@@ -1,4 +1,4 @@
-"""Scores of pictures, and what scores of many objects say: means with intervals, differences on the same objects.
+"""Scores of pictures, and statistics over objects: means with intervals, paired differences.
 
 Pictures are sRGB in [0, 1] on white, (*batch, height, width, 3); lengths are pixels.  FLIP (Andersson et al. 2020, low
 dynamic range) compares what the eye resolves at PIXELS_PER_DEGREE, by the package `flip-evaluator`.  LPIPS (Zhang et
@@ -76,7 +76,7 @@ Scores = dict[str, np.ndarray]  # metric -> score of each view (views,); cpsnr i
 
 
 def metric_settings() -> dict[str, str]:
-    """What stands beside every table: how its numbers were measured."""
+    """How the metrics were measured; shown beside every table."""
     return {
         "images": "sRGB in [0, 1] over white; means over images",
         "PSNR": "at most 100 dB; cPSNR over the pixels of visible input points, images without any left out",

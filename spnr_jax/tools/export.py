@@ -1,4 +1,4 @@
-"""What leaves the package: a cloud's object as splats or as a page for any browser, and the network itself.
+"""Exports: a cloud's object as splats or as a page for any browser, and the network itself.
 
 Splats have y up, the units of the cloud's file and, unless float32 is too coarse there, its origin.
 
@@ -77,7 +77,7 @@ def export_object(options: Export, note: Say) -> str:
 
 
 def make_render_options(options: Export | Share, cloud: Path, run: Path | None) -> Render:
-    """What the options ask of a cloud, as those of `spnr render`."""
+    """The same options for a cloud in the form of `spnr render`."""
     return Render(
         cloud=cloud,
         run=run,
@@ -146,7 +146,7 @@ def page(
         "DATA": base64.b64encode(spz_of(gaussians)).decode(),
     }
     text = resources.files("spnr_jax.tools").joinpath("share_page.html").read_text("utf-8")
-    first, *others = text.split("@")  # what stands between two is a name: the parts hold any characters
+    first, *others = text.split("@")  # text between two @ is a name: the parts may hold any characters
     content = (first + "".join(parts.get(piece, piece) for piece in others)).encode(errors="replace")
     if len(content) > MOST_BYTES:
         raise UserError(
@@ -159,14 +159,14 @@ def page(
 # --- the network ------------------------------------------------------------------------------------------------------
 
 
-RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
+RADIUS = 0.8  # of the ball in the box for whose pictures the sizes are planned: it has as much surface as a cube
 BLOCK = 256  # points whose distances to all are in memory at once
 
 Arrays = dict[str, Any]
 
 
 def export_network(options: Export) -> str:
-    """Writes what `spnr export RUN` does; a line about it."""
+    """Writes the files of `spnr export RUN`; returns a line about them."""
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
     model = Model(config=trained.config.model, variables=trained.variables)
     _check_exportable(model)
@@ -208,7 +208,7 @@ def export_render(
     """The serialised function `(volume, camera, light) -> picture` for square pictures, by default of the network's
     size, for scenes of `num_points` points.
 
-    The sizes are those of a plan: by default of a ball of so many points, with room to spare.  `platforms` as for
+    Sizes come from a plan, by default that of a ball with `num_points` points, with a margin.  `platforms` as for
     `export_encode`.
     """
     _check_exportable(model)
@@ -230,7 +230,7 @@ def load_exported(content: bytes) -> Callable[..., Arrays]:
 
 
 def signature(content: bytes) -> dict[str, Any]:
-    """Shapes and types of what an exported function takes (a list, for its arguments) and gives, and its platforms."""
+    """Shapes and types of the arguments (a list) and outputs of an exported function, and its platforms."""
     exported = _deserialise(content)
     (arguments, _), outputs = (
         jax.tree.map(lambda x: {"shape": list(x.shape), "dtype": str(x.dtype)}, jax.tree.unflatten(tree, shapes))
@@ -286,7 +286,7 @@ def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " point
 
 
 def make_plan(model: Model, num_points: int, size: int) -> Plan:
-    """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
+    """Sizes, with a margin, for pictures of any object of `num_points` points by `Model.camera`."""
     ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
     scene = surfel_method.encode_in_box(ball)
     made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
@@ -295,7 +295,7 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
 
 
 def cloud_shapes(num_points: int) -> Arrays:
-    """What `encode` takes."""
+    """Shapes of the arguments of `encode`."""
     vectors, scalars, mask = _floats(num_points, 3), _floats(num_points), jax.ShapeDtypeStruct((num_points,), np.bool_)
     return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
 

@@ -45,14 +45,14 @@ SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, sli
 
 
 def light_of_options(options: Lighting, read: Callable[[str], Light] = read_light) -> Light:
-    """The light that the options ask for; `read` gives that of a map by its name."""
+    """The light of the options; `read` returns the light of a map by name."""
     parts = [read(options.light or "room").turned(options.light_yaw)] if options.light or not options.sun else []
     parts += [sun(*options.sun, color=SUN)] if options.sun else []
     return 2.0**options.exposure * reduce(add, parts)
 
 
 def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
-    """ValueError, naming the options, where something is asked of the light and the network takes none."""
+    """ValueError, naming the options, if light options are given and the network takes no light."""
     if asked and not method_of(model.config).takes_light:
         raise UserError(
             f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
@@ -61,7 +61,7 @@ def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> N
 
 
 def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
-    """The picture before what is wanted behind it: white, as it is, or the map of the light."""
+    """The picture in front of its background: white, or the map of the light."""
     if wanted == "white" or light is None:
         return rendering
     behind = np.asarray(_draw_background(light, camera))
@@ -71,7 +71,7 @@ def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Lig
 
 @jax.jit
 def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
-    """The light's map as a camera sees it, sRGB."""
+    """The environment map as seen by a camera, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
     return linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1))
 
@@ -82,7 +82,7 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedObject:
-    """A cloud that is read and encoded, and what draws it."""
+    """An encoded cloud, and the model and light that render it."""
 
     placed: PlacedCloud
     model: Model
@@ -91,7 +91,7 @@ class PreparedObject:
 
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
-    """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
+    """Writes the files of the options; yields a line about each; `note` gets the assumptions about the cloud."""
     images.check_place(options.out / options.cloud.stem)
     ready = prepare_cloud(options, note)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
@@ -120,14 +120,14 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
 
 
 def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Callable[[], str]]:
-    """Draws what the options ask for; yields what writes it, in any thread, and gives a line about it.
+    """Renders the views of the options; yields functions that write a file, in any thread, and return a line about it.
 
-    Stills and film are drawn in one go: views that share their sizes share their programs.
+    Stills and film are rendered together: views with the same sizes share programs.
     """
     stills = still_views(ready, options)
     film = turntable_views(ready, options) if options.turntable != "none" else []
     views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
-    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
+    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", still_files(rendering, camera, ready.volume, options))
     if cameras:
         document = cameras_document(cameras, name.name, ready.placed, ready.volume)
@@ -159,7 +159,7 @@ def _camera(ready: PreparedObject, azimuth: float, options: Render) -> Camera:
 
 
 def _draw(ready: PreparedObject, views: list[View], options: Render) -> Iterator[Rendering]:
-    """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
+    """Renderings of the views, one after the other, in front of their background."""
     cameras, lights = [camera for camera, _ in views], [light for _, light in views]
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
     for (camera, light), rendering in zip(views, renderings, strict=True):
@@ -178,7 +178,7 @@ def _write_film(path: Path, film: list[np.ndarray], options: Render) -> str:
 
 
 def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> Iterator[tuple[str, bytes]]:
-    """(what follows the view's name, content) of the files of one view."""
+    """(suffix of the name, content) of the files of one view."""
     acc = np.asarray(rendering.acc)
     if "image" in options.outputs:
         image = np.asarray(rendering.image)
@@ -193,7 +193,7 @@ def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: R
 
 
 def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
-    """RGBA (h, w, 4) in [0, 1] that gives the image when it is laid on white; the opacity (h', w') is interpolated."""
+    """RGBA (h, w, 4) in [0, 1] that equals the image on white; the opacity (h', w') is interpolated."""
     alpha = np.asarray(Image.fromarray(acc.astype(np.float32)).resize(image.shape[1::-1], Image.Resampling.BILINEAR))
     alpha = np.clip(alpha, 0, 1)[..., None]
     color = (np.clip(image, 0, 1) - (1 - alpha)) / np.maximum(alpha, INVISIBLE)
@@ -201,7 +201,7 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
 
 
 def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:
-    """The views in the nerfstudio convention, and what was done to the points: box = scale * (rotation p - centre)."""
+    """The views in the nerfstudio convention, and the transform of the points: box = scale * (rotation p - centre)."""
     camera = cameras[0]
     intrinsics, scale = np.asarray(camera.intrinsics, np.float64), float(volume.scale)
     return {
