@@ -156,7 +156,7 @@ class TestBlend:
         entries, lost = make_entries(found, view, capacity=TOTAL)
         assume(int(lost) == 0 and int(splatting.count_covered_pixels(entries)) > 0)
         buffer = blend(entries, found, found.base_color, view, slots=24**2)
-        names = ("opacity", "coverage", "depth", "spread", "log_spacing", "normal", "attributes")
+        names = ("opacity", "coverage", "depth", "depth_deviation", "log_spacing", "normal", "attributes")
         entries, buffer = jax.tree.map(np.asarray, (entries, buffer))
         for pixel in rng.choice(entries.pixel[entries.pixel < 24**2], 3):
             ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
@@ -211,6 +211,6 @@ class TestBlend:
         one, other = (draw(found, camera(24, (0.3 + step, 0.2, 2.4)))[0] for step in (0.0, 1e-6))
         assert np.abs(one.opacity - other.opacity).max() < 2e-4
         assert np.abs(one.sharp_weight - other.sharp_weight).max() < 2e-4
-        for name in ("attributes", "normal", "color", "beside"):
+        for name in ("attributes", "normal", "color", "centre_offset"):
             change = one.opacity[..., None] * getattr(one, name) - other.opacity[..., None] * getattr(other, name)
             assert np.abs(change).max() < 2e-4, name
