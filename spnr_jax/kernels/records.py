@@ -72,7 +72,7 @@ class Rendering:
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
     overflow: Int[Array, "*batch"] | None = None
-    """Of surfels: entries, pixels, columns and rows that did not fit into the sizes of the plan; 0: all is drawn."""
+    """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 
 
 @no_type_check
@@ -96,7 +96,7 @@ class Volume:
     centre: Float[AnyArray, "3"]
     scale: Float[AnyArray, ""]
     reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
-    """Voxels around points that rays look at, from how far the points lie apart."""
+    """Voxels around points within which rays are sampled; follows from the point spacing."""
 
 
 @no_type_check

@@ -3,7 +3,7 @@
 A batch depends only on the step, so the step number is the state of the reader: a resumed run gets the same data,
 whatever was read ahead.
 
-Faults are noise, outliers, unseen surface, uneven density, colours without materials.  Their functions take and return
+Faults are noise, outliers, hidden surface, uneven density, colours without materials.  Their functions take and return
 (positions (n, 3), other columns by name) with a generator of random numbers.  Lengths are in units of the box whose
 half diagonal is 1; the points must lie in it.  `random_scan` draws several.
 """
@@ -55,7 +55,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
         generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
-        cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them, if they need any
+        cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them if needed
         clouds_of.append(choose_points(cloud, count, config.max_points, generator, config.even_share))
         chosen = generator.permutation(len(item.images))[: config.views_per_object]
         camera = item.camera.cam_to_world, item.camera.intrinsics
@@ -123,7 +123,7 @@ def batches(
 
 
 def read_ahead(assemble: Callable[[int], Any], first_step: int, config: TrainConfig) -> Generator[Any, None, None]:
-    """What `assemble` makes of each step, some steps ahead in threads, which end with this generator."""
+    """Results of `assemble` for each step, computed ahead in threads, which end with this generator."""
     steps = range(first_step, config.num_steps)
     yield from run_ahead((functools.partial(assemble, step) for step in steps), READERS, READ_AHEAD)
 
@@ -163,9 +163,9 @@ Points = tuple[np.ndarray, dict[str, np.ndarray]]
 Fault = Callable[[np.ndarray, dict[str, np.ndarray], np.random.Generator], Points]
 
 SCANNER = 2.5  # distance of a virtual scanner from the middle of the box
-BEHIND = 3.0  # spacings behind the first of its pixel that a scanner still sees a point
-BALLS = 0.03, 0.15  # radii of what is left out
-SHADED = 0.2, 0.7  # of a colour that a lamp's direction takes away at most
+BEHIND = 3.0  # spacings behind the first point of a pixel within which points are visible
+BALLS = 0.03, 0.15  # radii of holes
+SHADED = 0.2, 0.7  # largest share of a colour that shading removes
 NOISE, OUTLIERS = (0.001, 0.02), (0.002, 0.05)  # of random scans, drawn from the logarithm
 MISREGISTERED, COLOR_NOISE = 0.004, 0.08  # at most
 THINNEST = 0.1  # density at one end of a cloud of uneven density, over that at the other
@@ -177,7 +177,7 @@ def add_noise(positions, values, rng, *, sigma: float) -> Points:
 
 
 def add_outliers(positions, values, rng, *, share: float) -> Points:
-    """So many more points, uniform in the bounding box, with the columns of points drawn at random."""
+    """A share of outliers, uniform in the bounding box, with the columns of random points."""
     count = round(share * len(positions))
     low, high = positions.min(axis=0), positions.max(axis=0)
     copied = rng.integers(len(positions), size=count)
@@ -188,7 +188,7 @@ def add_outliers(positions, values, rng, *, share: float) -> Points:
 
 
 def simulate_scanners(positions, values, rng, *, scanners: int) -> Points:
-    """What scanners in random directions from the middle see."""
+    """The points that scanners in random directions see."""
     spacing, visible = measure_spacing(positions), np.zeros(len(positions), bool)
     for direction in rng.normal(size=(scanners, 3)):
         visible |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
@@ -196,13 +196,13 @@ def simulate_scanners(positions, values, rng, *, scanners: int) -> Points:
 
 
 def misregister(positions, values, rng, *, sigma: float) -> Points:
-    """Two scans that do not quite meet: the points on one side of a random plane are moved together."""
+    """Two misaligned scans: the points on one side of a random plane are shifted together."""
     apart = positions @ rng.normal(size=3) > 0
     return positions + apart[:, None] * sigma * rng.normal(size=3), values
 
 
 def drop_balls(positions, values, rng, *, balls: int) -> Points:
-    """Nothing is left in balls around random points."""
+    """The points outside of balls around random points."""
     middles, radii = positions[rng.integers(len(positions), size=balls)], rng.uniform(*BALLS, balls)
     kept = (((positions[:, None] - middles) ** 2).sum(axis=-1) > radii**2).all(axis=1)
     kept[0] = True
@@ -216,7 +216,7 @@ def add_color_noise(positions, values, rng, *, sigma: float) -> Points:
 
 
 def bake_light(positions, values, rng) -> Points:
-    """Base colours darkened as a lamp in a grey room would, as a photograph has them; as they are without normals."""
+    """Base colours shaded by a lamp, as in a photograph; unchanged without normals."""
     if "normals" not in values:
         return positions, values
     lamp = rng.normal(size=3)
@@ -226,13 +226,13 @@ def bake_light(positions, values, rng) -> Points:
 
 
 def drop_materials(positions, values, rng) -> Points:
-    """Roughness 0.5 and metallic 0 everywhere and not known, as a file without materials is read."""
+    """Roughness 0.5 and metallic 0, both unknown, as in a file without materials."""
     flat = {"roughness": 0.5, "metallic": 0.0, "materials_known": 0.0}
     return positions, values | {name: np.full(len(positions), x, np.float32) for name, x in flat.items()}
 
 
 def thin_unevenly(positions, values, rng) -> Points:
-    """A density that falls exponentially in a random direction, to THINNEST."""
+    """Density that falls exponentially along a random direction, to THINNEST."""
     along = positions @ rng.normal(size=3)
     place = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
     kept = rng.uniform(size=len(positions)) < THINNEST**place
