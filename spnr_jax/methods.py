@@ -208,7 +208,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
         if dataclasses.is_dataclass(expected):
             require(isinstance(value, dict), f"config field {path}{name} holds {value!r}, which is no JSON object")
             if expected is NetworkConfig:
-                expected = _sizes(value.get("method"), value.get("source"), path)
+                expected = _find_config_class(value.get("method"), value.get("source"), path)
                 value = {field: inner for field, inner in value.items() if field not in ("method", "source")}
             value = from_dict(value, expected, f"{path}{name}.")
         value = tuple(value) if isinstance(value, list) else value
@@ -218,7 +218,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     return kind(**arguments)
 
 
-def _sizes(name: Any, source: Any, path: str) -> type[NetworkConfig]:
+def _find_config_class(name: Any, source: Any, path: str) -> type[NetworkConfig]:
     """The config class of the network that a file names; nothing is imported for it."""
     if isinstance(name, str) and name in METHODS:
         return METHODS[name].config

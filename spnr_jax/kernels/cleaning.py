@@ -234,7 +234,7 @@ def denoise(
         return _denoise_step(start[piece], own[piece], tree, others, sigma, radius, color_sigma)
 
     moved = np.concatenate([moved_of(slice(i, i + ROWS)) for i in range(0, len(start), ROWS)])
-    means = _means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
+    means = _local_means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
     if "normals" in means:
         means["normals"] = unit_means(means["normals"])
     return moved, means
@@ -272,7 +272,7 @@ def _denoise_step(
     return moved + towards[:, :1] * axes[..., 0]
 
 
-def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
+def _local_means(positions: np.ndarray, columns: Values, radius: float) -> Values:
     """Local means of the columns, over the points around each position."""
     tree = cKDTree(positions)
     pieces = [_query_neighbors(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]

@@ -97,7 +97,7 @@ def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> t
     if not merged:
         return positions, values, 0
     kept = np.sort(first)
-    values = {name: _means(column, group)[group[kept]] for name, column in values.items()}
+    values = {name: _group_means(column, group)[group[kept]] for name, column in values.items()}
     if "normals" in values:
         values["normals"] = unit_means(values["normals"])
     return positions[kept], values, merged
@@ -135,14 +135,17 @@ def find_distinct(
     return ranked[new], rows
 
 
-def measure_spacing(tree: cKDTree) -> float:
-    """Median side of the square that a point represents, from the distances of many neighbours."""
-    count = max(2, min(AROUND, tree.n // 4))
-    radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count])[0]
+def measure_spacing(tree: cKDTree, neighbors: int | None = None, sample: int = SAMPLE) -> float:
+    """Median side of the square that a point represents, from the distance to its nth nearest point, itself included.
+
+    By default n is AROUND, at most a quarter of the points, so that repeated copies of a scan do not bias it.
+    """
+    count = neighbors or max(2, min(AROUND, tree.n // 4))
+    radius = tree.query(tree.data[:: -(-tree.n // sample)], [count], workers=-1)[0]
     return float(np.median(radius)) * float(np.sqrt(np.pi / count))
 
 
-def _means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _group_means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Means (groups, ...) of the rows of each group."""
     order = np.argsort(group, kind="stable")
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))

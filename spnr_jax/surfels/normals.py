@@ -119,16 +119,12 @@ def find_visible(
 
 
 def measure_spacing(positions: Float[np.ndarray, "points 3"]) -> float:
-    """Median side of the square that a point represents, from a sample of the points; 0 for fewer than two points."""
+    """Median side of the square that a point represents, from 16 neighbours; 0 for fewer than two points."""
     return _measure_spacing(cKDTree(positions))
 
 
 def _measure_spacing(tree: cKDTree) -> float:
-    if tree.n < 2:
-        return 0.0
-    count = min(NEIGHBORS, tree.n)
-    radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count], workers=-1)[0]
-    return float(np.median(radius)) * float(np.sqrt(np.pi / count))
+    return 0.0 if tree.n < 2 else cloud_arrays.measure_spacing(tree, min(NEIGHBORS, tree.n), SAMPLE)
 
 
 # --- thinned clouds ---------------------------------------------------------------------------------------------------

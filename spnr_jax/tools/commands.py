@@ -50,7 +50,7 @@ MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on 
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatMaking:
+class SplatOptions:
     """How Gaussian splats are made from a cloud."""
 
     most_splats: int = 150_000
@@ -67,7 +67,7 @@ class SplatMaking:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class ReadOptions:
     """How a file of points or a mesh is read."""
 
     num_points: int = 16384
@@ -84,7 +84,7 @@ class Reading:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share(Reading):
+class Share(ReadOptions):
     """Write one .html file that shows a cloud's object in any browser: Gaussian splats to turn, a poster, a title."""
 
     cloud: tyro.conf.Positional[Path]
@@ -99,7 +99,7 @@ class Share(Reading):
     """Network that renders it, as for `spnr render` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into the splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
     """How the splats are made."""
     azimuth: float = 30.0
     """Azimuth, in degrees, of the page's first view."""
@@ -120,7 +120,7 @@ Output = Literal["image", "depth", "opacity"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Reading):
+class Render(ReadOptions):
     """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity."""
 
     cloud: tyro.conf.Positional[Path]
@@ -230,7 +230,7 @@ class Export:
     """Network that renders the cloud for --splats, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into --splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
     """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The upward axis of the file for --splats, which are written with y up."""
@@ -254,7 +254,7 @@ class Export:
         require_at_least(self, 1, "num_points")
         given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
         given += ["light"] if self.lighting.is_given else []
-        given += ["most-splats"] if self.making != SplatMaking() else []
+        given += ["most-splats"] if self.making != SplatOptions() else []
         require(
             self.splats is not None or not given, f"--{''.join(given[:1])} is for --splats FILE, which is not given"
         )
@@ -263,7 +263,7 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Reading):
+class View(ReadOptions):
     """View the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
     cloud: tyro.conf.Positional[Path]

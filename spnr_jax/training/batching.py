@@ -32,7 +32,10 @@ from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
 READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
-ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
+ORDER_STREAM, SAMPLE_STREAM = (
+    1,
+    2,
+)  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
 
 def choose_points(
@@ -52,7 +55,7 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
     """The training batch of these objects at this step: random points and random views of each."""
     clouds_of, views_of = [], []
     for i, item in enumerate(objects):
-        generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
+        generator = np.random.default_rng((config.seed, SAMPLE_STREAM, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
         cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them if needed
@@ -83,7 +86,7 @@ def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list
 @functools.lru_cache(maxsize=4)  # one batch spans few epochs, and a million objects take 20 ms to permute
 def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
     """The permutation (count,) of all objects in an epoch."""
-    return np.random.default_rng((seed, ORDER, epoch)).permutation(count)
+    return np.random.default_rng((seed, ORDER_STREAM, epoch)).permutation(count)
 
 
 def prepare(

@@ -48,19 +48,23 @@ CLOUDS = 2  # per object
 SCANNED = 0.3  # share of the clouds that are simulated scans, cleaned
 UNKNOWN_MATERIALS = 0.1  # share of the other clouds whose roughness and metallic are unknown
 WITHOUT_NORMALS = 0.5  # share of the other clouds without given normals
-ALONE = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
+OWN_NORMALS = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # a view averages side x side pixels of its reference; drawn from these
 SMALL, FEWER = 4, 8  # from this side on, a cloud has at most 1 / FEWER of the points
 MOST_ENTRIES = 2**22  # of a view: one with more is dropped
-LEAST = 8  # least pixels along the shorter side of a view
+LEAST_PIXELS = 8  # least pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel belongs to it
 SIZES = (96, 72, 48, 48, 32)  # pixels along a crop, by doublings; scaled if config.crop is not the first
 MARGINS = (0, 4, 8, 14, 10)  # pixels on each side of a crop that are input but not output, by doublings
 SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
-TRIES, LEAST_COVERED, DRAWN = 4, 0.15, 0.02  # positions tried for a crop, until so large a share of it has this opacity
-LARGEST = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
+TRIES, LEAST_COVERED, VISIBLE_OPACITY = (
+    4,
+    0.15,
+    0.02,
+)  # positions tried for a crop, until so large a share of it has this opacity
+LARGEST_FLOAT16 = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
 LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it is 0
-CLOUD, CROP = 3, 4  # random streams under one seed, in addition to those of `batching`
+CLOUD_STREAM, CROP_STREAM = 3, 4  # random streams under one seed, in addition to those of `batching`
 
 ROOM = "procedural room"  # its name in data sets
 
@@ -154,7 +158,7 @@ def _doublings(path: Path) -> list[int] | None:
 
 def make_views(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud with this index."""
-    generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
+    generator = np.random.default_rng((config.seed, CLOUD_STREAM, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
     scene = encode_in_box(surfel_method.densify_sparse(variables, cloud))
@@ -183,7 +187,7 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
         if generator.random() < UNKNOWN_MATERIALS:
             points = points._replace(values=drop_materials(*points[:2], generator)[1])
         if generator.random() < WITHOUT_NORMALS:
-            alone = generator.random() < ALONE
+            alone = generator.random() < OWN_NORMALS
             if not alone:
                 points.values.pop("normals", None)
     chosen = generator.permutation(len(points.positions))[:count]
@@ -213,7 +217,7 @@ def make_view(
     doublings, finer = surfel_renderer.choose_resolution(scene, small)
     # drawn at twice the size, it is compared at that size, or at the reference's if that has no more pixels
     side, scale = max(side // finer, 1), 2**doublings
-    if any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
+    if any(n % (side * scale) or n // (side * scale) < LEAST_PIXELS for n in image.shape[:2]):
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
     needed = jax.device_get(surfel_renderer.count_sizes(scene, drawn, doublings=0, side=1))
@@ -230,7 +234,7 @@ def make_view(
     rows, columns = _find_bounds(inside.any(axis=1)), _find_bounds(inside.any(axis=0))
     return doublings, {
         "seen": inputs[rows, columns].astype(np.float16),
-        "maps": np.clip(maps[rows, columns], -LARGEST, LARGEST).astype(np.float16),
+        "maps": np.clip(maps[rows, columns], -LARGEST_FLOAT16, LARGEST_FLOAT16).astype(np.float16),
         "ambient": ambient,
         "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
     }
@@ -276,7 +280,7 @@ def batches(views: list[View], config: TrainConfig, first_step: int) -> Generato
 
 def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:
     """The batch of a step: crops of random views with equal doublings, randomly mirrored."""
-    generator = np.random.default_rng((config.seed, CROP, step))
+    generator = np.random.default_rng((config.seed, CROP_STREAM, step))
     shares = np.array([SHARES[doublings] for doublings in sorted(views)])
     doublings = int(generator.choice(sorted(views), p=shares / shares.sum()))
     size, margin = (-(-config.crop * n[doublings] // SIZES[0]) for n in (SIZES, MARGINS))
@@ -306,7 +310,7 @@ def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.
     inputs, inner = view["seen"], size - 2 * margin
     for _ in range(TRIES):
         top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in inputs.shape[:2])
-        if np.mean(inputs[top : top + inner, left : left + inner, 0] > DRAWN) > LEAST_COVERED:
+        if np.mean(inputs[top : top + inner, left : left + inner, 0] > VISIBLE_OPACITY) > LEAST_COVERED:
             break
 
     def cut(values: np.ndarray, margin: int, scale: int) -> np.ndarray:
