@@ -1,4 +1,4 @@
-"""Laws of the densifier: where children may lie, batching, order, padding, turning, gradients, few and equal points."""
+"""Laws of the densifier: where learned points lie, batching, order, padding, turning, gradients, few and equal points."""
 
 import dataclasses
 import functools
@@ -43,7 +43,7 @@ def kept(dense):
     return rows[np.lexsort(np.round(rows[:, :3], 3).T)]
 
 
-def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
+def test_measured_points_are_kept_as_they_are_and_learned_points_are_told(params):
     points = ball()
     dense = run(params, points, spnr_jax.neighbors(points))
     assert dense.mask.shape == (SIZE * (1 + CANDIDATES),)
@@ -57,14 +57,14 @@ def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
 
 
-def test_children_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
+def test_learned_points_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
     points, spacing = cloud(shape("sphere", SIZE)[0]), np.sqrt(4 * np.pi / SIZE)
     dense = run(params, points, spnr_jax.neighbors(points))
-    children = np.asarray(dense.positions)[SIZE:][np.asarray(dense.mask)[SIZE:]]
-    off = np.abs(np.linalg.norm(children, axis=1) - 0.6)
-    assert len(children) > 2 * SIZE
+    learned = np.asarray(dense.positions)[SIZE:][np.asarray(dense.mask)[SIZE:]]
+    off = np.abs(np.linalg.norm(learned, axis=1) - 0.6)
+    assert len(learned) > 2 * SIZE
     assert np.sqrt(np.mean(off**2)) < 0.6 * (1 - np.cos(spacing / 2)) / 2
-    assert cKDTree(children).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * spacing
+    assert cKDTree(learned).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * spacing
 
 
 def nodes_of(positions, normals, spacing):
@@ -85,7 +85,7 @@ def test_places_of_pairs_lie_on_circles_that_their_ends_do():
     close(np.linalg.det(frames), 1, atol=1e-5)
 
 
-def test_no_two_children_are_nearer_than_the_closest(params):
+def test_no_two_learned_points_are_nearer_than_the_closest(params):
     points = cloud(shape("sphere", SIZE, "random")[0])
     near = spnr_jax.neighbors(points)
     dense = jax.tree.map(lambda x: np.asarray(x)[SIZE:], run(params, points, near))
@@ -121,7 +121,7 @@ def test_blocks_are_the_whole_at_once(params, monkeypatch):
     jax.tree.map(lambda *x: close(*(y[np.asarray(places.exists)] for y in x), atol=1e-5), *found)
 
 
-def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
+def test_a_dense_cloud_gets_learned_points_where_it_ends_or_bends_alone(monkeypatch):
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(31)), axis=-1).reshape(-1, 2)
     edge = np.concatenate([np.insert(grid[:400], 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)])
     near = spnr_jax.neighbors(cloud(edge * 0.05))
@@ -151,7 +151,7 @@ def test_padding_and_the_order_of_points_do_not_matter(params):
     assert (distance < 1e-3).mean() > 0.97  # which end owns a pair follows the numbers, and some points own too many
 
 
-def test_a_turned_cloud_has_turned_children(params):
+def test_a_turned_cloud_has_turned_learned_points(params):
     normals = shape("sphere", SIZE, "random")[1]
     turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
     points = cloud(0.6 * normals)

@@ -48,7 +48,7 @@ def test_the_network_sees_no_light():
 
 @pytest.mark.parametrize(("name", "column"), [("materials_unknown", 30), ("learned", 31)])
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_one_number_says_whether_materials_are_guessed_and_one_whether_points_are_and_no_other_does(
+def test_one_input_says_whether_materials_are_unknown_and_one_whether_points_are_learned_and_no_other_does(
     name, column, share
 ):
     positions, normal, spacing = shape("sphere", 500)
