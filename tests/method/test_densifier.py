@@ -1,4 +1,4 @@
-"""Laws of the densifier: where learned points lie, batching, order, padding, turning, gradients, few and equal points."""
+"""Laws of the densifier: where learned points lie, batching, order, padding, rotation, gradients, degenerate clouds."""
 
 import dataclasses
 import functools
