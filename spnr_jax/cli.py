@@ -52,9 +52,9 @@ def parse(arguments: list[str]) -> Command:
     if source is not None:
         methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
-    said = io.StringIO()
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(stderr):
             return tyro.cli(
                 train | Evaluate | Render | View | Export | Share,
                 prog="spnr",
@@ -63,7 +63,7 @@ def parse(arguments: list[str]) -> Command:
             )
     except SystemExit as stop:
         if stop.code:
-            raise UserError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
+            raise UserError(re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])) from None  # without the title
         raise
 
 

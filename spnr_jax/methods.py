@@ -26,9 +26,9 @@ from spnr_jax.presets import PRESETS
 Function = Callable[..., Any]
 
 
-def lazy(place: str) -> Function:
+def lazy(path: str) -> Function:
     """A function that imports "package.module:name" when it is first called, and calls it."""
-    module, _, name = place.partition(":")
+    module, _, name = path.partition(":")
 
     def call(*arguments: Any, **named: Any) -> Any:
         return getattr(importlib.import_module(module), name)(*arguments, **named)
@@ -134,20 +134,20 @@ def register(method: Method) -> None:
 def include(source: Path | str) -> None:
     """Imports a module or a .py file that registers methods; a one-line ValueError if that fails."""
     name = str(source)
-    place = Path(name).resolve() if name.endswith(".py") else name
-    if place in _included.values():
+    location = Path(name).resolve() if name.endswith(".py") else name
+    if location in _included.values():
         return
     before = set(METHODS)
     try:
         with _working_folder():
-            _import_file(place) if isinstance(place, Path) else importlib.import_module(place)
+            _import_file(location) if isinstance(location, Path) else importlib.import_module(location)
     except (ImportError, SyntaxError, OSError) as error:
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from None
     known = METHODS.keys() - before or any(m.source.startswith(name) for m in METHODS.values())
     require(bool(known), f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
     for method in METHODS.keys() - before:
         METHODS[method] = dataclasses.replace(METHODS[method], source=name)
-    _included[name] = place
+    _included[name] = location
 
 
 @contextmanager
@@ -170,9 +170,9 @@ def _import_file(path: Path) -> None:
 
 def network(config: NetworkConfig) -> Any:
     """The Linen module for a network's config; its code is imported at the first call."""
-    made = method_of(config).network
-    assert made is not None, f"{config.method} is no Linen module"
-    return (lazy(made) if isinstance(made, str) else made)(config)
+    found = method_of(config).network
+    assert found is not None, f"{config.method} is no Linen module"
+    return (lazy(found) if isinstance(found, str) else found)(config)
 
 
 def method_of(config: NetworkConfig) -> Method:

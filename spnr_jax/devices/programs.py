@@ -130,18 +130,18 @@ class CachedProgram:
 
     def _program(self, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> Callable[..., Any]:
         """A function of the leaves; from a trace if programs are cached on disk."""
-        place = jax.config.values["jax_compilation_cache_dir"]
-        if place is None:
+        folder = jax.config.values["jax_compilation_cache_dir"]
+        if folder is None:
             return lambda *leaves: self.jitted(*jax.tree.unflatten(tree, leaves), **static)
-        trace = self._load(Path(place), tree, leaves, static, key)
+        trace = self._load(Path(folder), tree, leaves, static, key)
         return jax.jit(trace.call, compiler_options=self.options)
 
-    def _load(self, place: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
+    def _load(self, folder: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
         """The trace for these arguments: from disk, or a new one, which is written to disk."""
         name = self.function.__name__
         versions = jax.__version__, jax.default_backend(), jax.config.values["jax_enable_x64"]
         depends = repr((self.function.__module__, name, versions, key)).encode() + _digest_sources()
-        file = place / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
+        file = folder / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
         with contextlib.suppress(OSError):
             written = file.read_bytes()
             if hashlib.sha256(written[DIGEST:]).digest() == written[:DIGEST]:
@@ -151,7 +151,7 @@ class CachedProgram:
         trace = export.export(flat)(*shapes)
         content = bytes(trace.serialize())
         with contextlib.suppress(OSError):  # disk full or folder read-only: it is traced again next time
-            place.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
             unfinished = file.with_name(f".unfinished-{os.getpid()}-{file.name}")
             unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             os.replace(unfinished, file)

@@ -162,10 +162,10 @@ def _is_outlier(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength
     middle = np.median(score)
     deviation = 1.4826 * np.median(np.abs(score - middle))  # of a normal distribution with this MAD
     unlisted = np.bincount(near.ravel(), minlength=len(positions)) == 0
-    borne = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
-    outlier = score > middle + borne
+    limit = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
+    outlier = score > middle + limit
     if outlier.sum() <= FEW + CHANCE * len(positions):
-        outlier = score > middle + SURE * borne
+        outlier = score > middle + SURE * limit
     in_space = sparse[_measure_thickness(positions[around[:, : ROUND[0]]]) > ROUND[1]]
     if len(positions) >= LEAST_DENSE and len(in_space) <= MOST_ROUND * len(positions):
         outlier[in_space] = True

@@ -215,11 +215,11 @@ def multiply(
 
 def _eliminate(matrix: Array, right: Array) -> Array:
     """Gauss-Jordan elimination; positive definite systems need no pivoting."""
-    places = jnp.arange(len(matrix))[:, None, None]
+    indices = jnp.arange(len(matrix))[:, None, None]
 
     def eliminate(pivot: Array, rows: Array) -> Array:
         row = rows[pivot] / rows[pivot, pivot][None]
-        return jnp.where(places == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
+        return jnp.where(indices == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
 
     rows = jnp.concatenate([matrix, right], axis=1)
     return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]

@@ -53,8 +53,8 @@ def is_inside(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.nda
 def describe_crop(kept: int, total: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
     """The message about a cropped box whose points lie from low (3,) to high (3,); ValueError if it is empty."""
     if not kept:
-        asked = " ".join(f"{value:g}" for value in box)
-        raise UserError(f"--crop {asked}: none of the {total:,} points, they lie in the box {_format_box(low, high)}")
+        corners = " ".join(f"{value:g}" for value in box)
+        raise UserError(f"--crop {corners}: none of the {total:,} points, they lie in the box {_format_box(low, high)}")
     return f"--crop: {kept:,} of {total:,} points lie inside"
 
 

@@ -146,10 +146,10 @@ def propose(
     return ends, exists, jnp.take_along_axis(directions, order[..., None], axis=1)
 
 
-def project_to_tangent(way: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
+def project_to_tangent(direction: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
     """Unit vectors: the directions projected to the planes of the normals; any vector of the plane if that is 0."""
     axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(3)[:1], jnp.eye(3)[1:2])
-    flat = way - jnp.sum(way * normal, axis=1, keepdims=True) * normal
+    flat = direction - jnp.sum(direction * normal, axis=1, keepdims=True) * normal
     other = axis - jnp.sum(axis * normal, axis=1, keepdims=True) * normal
     return normalize(jnp.where(jnp.sum(flat**2, axis=1, keepdims=True) > 1e-6, flat, other))
 
@@ -163,14 +163,17 @@ def place_candidates(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Candidates:
     turned = turned | ((nodes.spacing[first] == nodes.spacing[second]) & (first > second))
     first, second = jnp.where(turned, second, first), jnp.where(turned, first, second)
     is_open = (first == second)[:, None]
-    way, scale = nodes.position[second] - nodes.position[first], (nodes.spacing[first] + nodes.spacing[second]) / 2
+    direction, scale = (
+        nodes.position[second] - nodes.position[first],
+        (nodes.spacing[first] + nodes.spacing[second]) / 2,
+    )
     one, two = nodes.normal[first], nodes.normal[second]
-    heights = jnp.sum(way * one, axis=1, keepdims=True), -jnp.sum(way * two, axis=1, keepdims=True)
-    curved = way / 2 - (heights[0] * one + heights[1] * two) / 8
+    heights = jnp.sum(direction * one, axis=1, keepdims=True), -jnp.sum(direction * two, axis=1, keepdims=True)
+    curved = direction / 2 - (heights[0] * one + heights[1] * two) / 8
     middle = nodes.position[first] + jnp.where(is_open, OPEN_DISTANCE * scale[:, None] * directions, curved)
     alike = jnp.sum(one * two, axis=1, keepdims=True) >= 0
     up = normalize(one + jnp.where(alike, two, -two))
-    along = project_to_tangent(jnp.where(is_open, directions, normalize(way / scale[:, None])), up)
+    along = project_to_tangent(jnp.where(is_open, directions, normalize(direction / scale[:, None])), up)
     frame = jnp.stack([along, jnp.cross(up, along), up], axis=1)
     around = find_nearest(nodes, neighbors, first, second, jax.lax.stop_gradient(middle))
     return Candidates(first, second, exists, middle, frame, scale, around)
@@ -324,12 +327,12 @@ def describe_points(nodes: Nodes, candidates: Candidates) -> tuple[Float[Array, 
 def compare_ends(nodes: Nodes, candidates: Candidates) -> Float[Array, "m 7"]:
     """Features that compare the two ends of each candidate."""
     one, two = candidates.first, candidates.second
-    way = (nodes.position[two] - nodes.position[one]) / candidates.scale[:, None]
-    heights = [jnp.sum(way * nodes.normal[x], axis=1) for x in (one, two)]
+    direction = (nodes.position[two] - nodes.position[one]) / candidates.scale[:, None]
+    heights = [jnp.sum(direction * nodes.normal[x], axis=1) for x in (one, two)]
     cosine = jnp.sum(nodes.normal[one] * nodes.normal[two], axis=1)
     unlike = length(nodes.color[one] - nodes.color[two])
     coarse = jnp.log(nodes.spacing[two] / nodes.spacing[one])
-    parts = [length(way), *heights, cosine, unlike, coarse, (one == two).astype(cosine.dtype)]
+    parts = [length(direction), *heights, cosine, unlike, coarse, (one == two).astype(cosine.dtype)]
     return clamp(jnp.stack(parts, axis=1), -8, 8)
 
 

@@ -34,8 +34,8 @@ def flip(
 ) -> Float[np.ndarray, "*batch"]:
     """Mean of FLIP's error map."""
     pairs = zip(_views(reference), _views(image), strict=True)
-    asked = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
-    means = [evaluate(wanted, shown, "LDR", **asked)[0].mean(dtype=np.float64) for wanted, shown in pairs]
+    options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
+    means = [evaluate(wanted, shown, "LDR", **options)[0].mean(dtype=np.float64) for wanted, shown in pairs]
     return np.array(means).reshape(np.shape(image)[:-3])
 
 

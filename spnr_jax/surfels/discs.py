@@ -47,12 +47,12 @@ def measure_layer_spacing(
 ) -> Float[Array, " block"]:
     """Spacing from the area of the disc that holds a number of neighbors on the same layer; in units of the box."""
     others = len(membership) - 1
-    held = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
-    wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * held[-1], 0.5))
+    summed = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
+    wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * summed[-1], 0.5))
     count = jnp.sum(hood.real, axis=0) - 1
-    last = jnp.minimum(sum_first((held < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
+    last = jnp.minimum(sum_first((summed < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
     chosen = jnp.arange(others, dtype=count.dtype)[:, None] == last[None]
-    weight, squared = sum_first(jnp.where(chosen, held, 0)), sum_first(jnp.where(chosen, hood.squared[1:], 0))
+    weight, squared = sum_first(jnp.where(chosen, summed, 0)), sum_first(jnp.where(chosen, hood.squared[1:], 0))
     spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * safe_sqrt(squared)
     low, high = const.spacing_bounds
     return jnp.where(count > 0, clamp(spacing, low * raw, high * raw), raw)
@@ -169,8 +169,8 @@ def find_rims(
     first = (constant[0] <= nearest[None]) & cut[None]
     turn = jnp.asarray(RIM_ANGLES, ends.dtype)
     direction = [
-        jnp.where(cut, sum_first(jnp.where(first, ways, 0)), of_turn[soonest])
-        for ways, of_turn in ((clip_lines.across, jnp.cos(turn)), (clip_lines.up, jnp.sin(turn)))
+        jnp.where(cut, sum_first(jnp.where(first, components, 0)), of_turn[soonest])
+        for components, of_turn in ((clip_lines.across, jnp.cos(turn)), (clip_lines.up, jnp.sin(turn)))
     ]
     right, high = unit(jnp.stack(direction))
 

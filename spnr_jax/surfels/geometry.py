@@ -79,10 +79,10 @@ def order_in_space(
     """
     tree = cKDTree(positions)
     order = tree.indices
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
     near = _query(tree, order)
-    return order, np.where(near < 0, np.int32(-1), place[near])
+    return order, np.where(near < 0, np.int32(-1), rank[near])
 
 
 def _query(tree: cKDTree, queried: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
@@ -177,8 +177,8 @@ def map_blocks(
     forms: list[Any] = []
 
     def compute(neighbors: Array, packed: Array) -> Array:
-        place, values = _unpack(packed, (points.position, own))
-        out = work(layers.gather_neighborhoods(neighbors, place, table), *values)
+        positions, values = _unpack(packed, (points.position, own))
+        out = work(layers.gather_neighborhoods(neighbors, positions, table), *values)
         forms.append(out)
         return _pack(out)
 
@@ -322,23 +322,23 @@ def describe_discs(
         normal: Array,
         one_sided: Array,
     ) -> dict[str, Array]:
-        normals, colors, sides, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
+        normals, colors, neighbors_one_sided, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
         axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0], const)
         flat = jnp.stack([project_on(hood.offset, axis) for axis in axes[:2]], axis=1)
         wider = discs.bridge_gaps(flat / spacing[None, None], weight, const)
         spacing = spacing * jnp.where(random, wider, 1)
-        place = jax.lax.optimization_barrier(flat / spacing[None, None])
-        there = (weight > 0.5) & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
-        ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + const.rim_margin
-        cuts = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, sides[:, 0], const)
-        rim, reach = discs.find_rims(ends, cuts, axes, const)
-        fitted = discs.find_color_edge(place, weight, spacing, axes, colors, const)
+        uv = jax.lax.optimization_barrier(flat / spacing[None, None])
+        nearby = (weight > 0.5) & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
+        ends = discs.find_farthest(jnp.where(nearby[:, None], uv, 0)) + const.rim_margin
+        clip_lines = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, neighbors_one_sided[:, 0], const)
+        rim_tangent, rim_distances = discs.find_rims(ends, clip_lines, axes, const)
+        color_edge = discs.find_color_edge(uv, weight, spacing, axes, colors, const)
         own = layers.weigh_distance(hood, raw_spacing, const) * layers.weigh_height(layer)
-        return fitted | {
+        return color_edge | {
             "spacing": spacing,
             "shape_ratios": measure_shape(layers.measure_covariance(hood, raw_spacing, own)),
-            "rim_tangent": rim,
-            "rim_distances": reach,
+            "rim_tangent": rim_tangent,
+            "rim_distances": rim_distances,
         }
 
     table = jnp.concatenate([normal, points.color, one_sided[None], layer_spacing[None]])

@@ -162,7 +162,7 @@ class QuadricFit(NamedTuple):
 
 
 def gather_neighborhoods(
-    neighbors: Int[Array, "k block"], place: Float[Array, "3 block"], columns: Float[Array, "columns all"]
+    neighbors: Int[Array, "k block"], positions: Float[Array, "3 block"], columns: Float[Array, "columns all"]
 ) -> Neighborhood:
     """The neighborhoods of points at given positions; the first three of the columns of all points are their positions.
 
@@ -170,9 +170,9 @@ def gather_neighborhoods(
     """
     real = neighbors >= 0
     found = gather(columns, neighbors)
-    offset = jnp.where(real[:, None], found[:, :3] - place[None], 0)
+    offset = jnp.where(real[:, None], found[:, :3] - positions[None], 0)
     offset, squared = jax.lax.optimization_barrier((offset, jnp.sum(offset**2, axis=1)))
-    return Neighborhood(real.astype(place.dtype), offset, squared, found[:, 3:])
+    return Neighborhood(real.astype(positions.dtype), offset, squared, found[:, 3:])
 
 
 def gather(columns: Float[Array, "columns all"], neighbors: Int[Array, "k block"]) -> Float[Array, "k columns block"]:
@@ -417,9 +417,11 @@ def measure_color_distance(
     return -jnp.expm1(-0.5 / const.color_sigma**2 * jnp.sum(change**2, axis=1)) * hood.real
 
 
-def _smaller_weight(held: Float[Array, " block"], others: Float[Array, " block"]) -> Float[Array, " block"]:
+def _smaller_weight(
+    total_weight: Float[Array, " block"], other_weight: Float[Array, " block"]
+) -> Float[Array, " block"]:
     """The smaller of two total weights: the neighbors of the point's color, and the others."""
-    return jnp.minimum(others, held - others - 1)  # the point is its own neighbor
+    return jnp.minimum(other_weight, total_weight - other_weight - 1)  # the point is its own neighbor
 
 
 def weigh_layer(

@@ -72,7 +72,7 @@ def _find_narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def face_sensor(
     positions: Float[np.ndarray, "points 3"],
     among: Float[np.ndarray, "all 3"],
-    place: Float[np.ndarray, "3"],
+    sensor: Float[np.ndarray, "3"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
     """The normals of `estimate_normals`, turned to the position of the sensor that saw the points.
@@ -81,7 +81,7 @@ def face_sensor(
     """
     tree = cKDTree(among)
     normals = _estimate_normals(positions, tree, max(noise, ROUGH * _measure_thickness(tree)))
-    towards = np.einsum("ni,ni->n", normals, place - positions)
+    towards = np.einsum("ni,ni->n", normals, sensor - positions)
     return np.where(towards[:, None] < 0, -normals, normals)
 
 
@@ -94,20 +94,20 @@ def _measure_thickness(tree: cKDTree) -> float:
 
 
 def find_visible(
-    positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
+    positions: Float[np.ndarray, "points 3"], sensor: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
 ) -> Bool[np.ndarray, " points"]:
-    """True for points visible from the place: the first in each pixel, and others up to `behind` spacings behind it.
+    """True for points visible from the sensor: the first in each pixel, and others up to `behind` spacings behind it.
 
     The sensor looks at the middle of the points; its pixels are CELL spacings wide there.
     """
-    way = positions.mean(axis=0) - place
-    distance = float(np.linalg.norm(way))
+    towards = positions.mean(axis=0) - sensor
+    distance = float(np.linalg.norm(towards))
     if not distance > 0 or not spacing > 0:
         return np.zeros(len(positions), bool)
-    forward = way / distance
+    forward = towards / distance
     right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right /= np.linalg.norm(right)
-    x, y, depth = np.stack([right, np.cross(right, forward), forward]) @ (positions - place).T
+    x, y, depth = np.stack([right, np.cross(right, forward), forward]) @ (positions - sensor).T
     before = np.flatnonzero(depth > spacing)
     pixels = np.floor(np.stack([x, y])[:, before] / depth[before] * (distance / (CELL * spacing)))
     _, rows = np.unique(pixels, axis=1, return_inverse=True)
@@ -161,8 +161,8 @@ def outward_normals(
     voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
     low, high = positions.min(axis=0), positions.max(axis=0)
     half = np.linalg.norm(high - low) / 2 or 1.0
-    places = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
-    order, near = order_in_space(places)
+    in_box = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
+    order, near = order_in_space(in_box)
     size = cloud_arrays.bucket(len(order))
 
     def columns(values: np.ndarray, fill: int = 0) -> Array:
@@ -174,10 +174,10 @@ def outward_normals(
         neighbors=columns(near, -1),
         mask=jnp.arange(size) < len(order),
         oriented=jnp.zeros(size, bool),  # whether the given normal is oriented
-        position=columns(places[order]),
+        position=columns(in_box[order]),
         color=columns(color[order]),
     )
-    found = np.empty_like(places)
+    found = np.empty_like(in_box)
     found[order] = np.asarray(_orient(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]
 

@@ -68,12 +68,12 @@ Say = Callable[[str], None]
 
 def export_object(options: Export, note: Say) -> str:
     """Writes a cloud's splats; a line about it.  `note` gets the assumptions about the cloud."""
-    asked = make_render_options(options, options.run, options.network)
+    render_options = make_render_options(options, options.run, options.network)
     assert options.splats is not None
     check_suffix(options.splats)
-    made = _splats(prepare_cloud(asked, note), options, note)
-    size = write_splats(options.splats, made, describe_source(asked))
-    return f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)"
+    gaussians = _splats(prepare_cloud(render_options, note), options, note)
+    size = write_splats(options.splats, gaussians, describe_source(render_options))
+    return f"wrote {options.splats} ({len(gaussians.opacity):,} splats, {size / 1e6:.1f} MB)"
 
 
 def make_render_options(options: Export | Share, cloud: Path, run: Path | None) -> Render:
@@ -88,23 +88,23 @@ def make_render_options(options: Export | Share, cloud: Path, run: Path | None) 
     )
 
 
-def describe_source(asked: Render) -> str:
+def describe_source(options: Render) -> str:
     """The line that names cloud, network and light, without folders."""
-    light = Path(asked.lighting.light or ("sun" if asked.lighting.sun else "room")).name
-    return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.PACKAGED).name}), light: {light}"
+    light = Path(options.lighting.light or ("sun" if options.lighting.sun else "room")).name
+    return f"{options.cloud.name}, drawn by spnr_jax ({Path(options.run or weights.PACKAGED).name}), light: {light}"
 
 
 def share(options: Share, note: Say) -> str:
     """Writes the page of a cloud; a line about it.  `note` gets the assumptions about the cloud."""
     images.check_place(options.out)
-    asked = make_render_options(options, options.cloud, options.run)
-    ready = prepare_cloud(asked, note)
+    render_options = make_render_options(options, options.cloud, options.run)
+    ready = prepare_cloud(render_options, note)
     gaussians = _splats(ready, options, note)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
-    said = " · ".join(filter(None, [describe_source(asked), options.credit]))
+    caption = " · ".join(filter(None, [describe_source(render_options), options.credit]))
     view = (options.azimuth, options.elevation)
-    content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, said)
+    content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, caption)
     images.write_whole(options.out, content)
     return f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)"
 
@@ -265,8 +265,8 @@ def encode(params: dict, cloud: Arrays) -> Arrays:
 def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
     """The picture of a scene as a dict of arrays; pure."""
     scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
-    seen = Camera(**camera, height=size, width=size)
-    drawn = surfel_renderer.render(params, scene, seen, Light(**light), plan=plan)
+    view = Camera(**camera, height=size, width=size)
+    drawn = surfel_renderer.render(params, scene, view, Light(**light), plan=plan)
     return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
 
 
@@ -289,9 +289,9 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
     """Sizes, with a margin, for pictures of any object of `num_points` points by `Model.camera`."""
     ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
     scene = surfel_method.encode_in_box(ball)
-    made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
-    side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
-    return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
+    plan = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
+    side = surfel_renderer.round_up(-(-size * plan.side // 2**plan.doublings) + surfel_renderer.MARGIN)
+    return plan._replace(width=side, height=side, entries=2 * plan.entries, slots=side * side)
 
 
 def cloud_shapes(num_points: int) -> Arrays:

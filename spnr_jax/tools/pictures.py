@@ -51,12 +51,12 @@ def light_of_options(options: Lighting, read: Callable[[str], Light] = read_ligh
     return 2.0**options.exposure * reduce(add, parts)
 
 
-def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
+def check_takes_light(model: Model, names: Sequence[str], run: Path | None) -> None:
     """ValueError, naming the options, if light options are given and the network takes no light."""
-    if asked and not method_of(model.config).takes_light:
+    if names and not method_of(model.config).takes_light:
         raise UserError(
-            f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
-            f"leave {'it' if len(asked) == 1 else 'them'} out, or --run"
+            f"{', '.join(names)}: the network of --run {run} knows the light of its training alone; "
+            f"leave {'it' if len(names) == 1 else 'them'} out, or --run"
         )
 
 

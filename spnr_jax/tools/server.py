@@ -60,19 +60,19 @@ def check_request(request: Request, token: str, reached_at: str | None = None) -
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
         return _refusal(CLOSED)
-    origins, asked = request.headers.get_all("Origin"), request.headers.get_all("Host")
-    if not all(_is_own(origin, asked, reached_at) for origin in origins):
+    origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
+    if not all(_is_own(origin, hosts, reached_at) for origin in origins):
         return _refusal(FOREIGN)
     return dataclasses.replace(request, path="/" + rest)
 
 
-def _is_own(origin: str, asked: list[str], reached_at: str | None) -> bool:
+def _is_own(origin: str, hosts: list[str], reached_at: str | None) -> bool:
     """Whether an origin is the requested host or reached_at; "null" (a file, a sandbox) is neither."""
-    scheme, _, place = origin.lower().partition("://")
+    scheme, _, address = origin.lower().partition("://")
     if scheme not in DEFAULT_PORTS:
         return False
     known = (reached_at or "").lower().removesuffix(DEFAULT_PORTS[scheme])
-    return [place] == [host.lower() for host in asked] or (known != "" and place == known)
+    return [address] == [host.lower() for host in hosts] or (known != "" and address == known)
 
 
 def _refusal(why: str) -> Response:
@@ -182,7 +182,7 @@ class Browser:
         self.loop = Loop(first, self._draw)
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
-        self._said = gui.add_markdown(PREPARING)
+        self._status = gui.add_markdown(PREPARING)
         with gui.add_folder("Picture"):
             self._add_picture(gui)
         with gui.add_folder("Light"):
@@ -198,9 +198,9 @@ class Browser:
         self.loop.start()
 
     def _look(self, camera: viser.CameraHandle) -> None:
-        seen = frame.read_view(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
-        if seen is not None:
-            self._replace(view=seen)
+        view = frame.read_view(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
+        if view is not None:
+            self._replace(view=view)
 
     def _draw(self, state: State, moving: bool) -> None:
         with self._network:
@@ -208,7 +208,7 @@ class Browser:
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
-            self._said.content = self._said.content.replace(PREPARING, "")
+            self._status.content = self._said.content.replace(PREPARING, "")
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))
@@ -221,8 +221,8 @@ class Browser:
         try:
             work()
         except (ValueError, OSError) as error:
-            said = " ".join(str(error).split())[:LONGEST_NOTE]
-            self._client.add_notification("That did not work", said, auto_close_seconds=10, color="red")
+            message = " ".join(str(error).split())[:LONGEST_NOTE]
+            self._client.add_notification("That did not work", message, auto_close_seconds=10, color="red")
 
     def _add_picture(self, gui: viser.GuiApi) -> None:
         names, hint = tuple(frame.qualities(self._model)), "While things move: draft, half the pixels"
@@ -247,8 +247,8 @@ class Browser:
 
         async def move(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself chooses a new map
-                said = {name: control.value for name, control in self._light.items()}
-                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **said)))
+                message = {name: control.value for name, control in self._light.items()}
+                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **message)))
 
         for control in self._light.values():
             control.on_update(move)
@@ -377,16 +377,16 @@ class Viewer:
             browser.loop.stop()
 
 
-def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
+def open_viewer(command: View) -> tuple[Viewer, list[str]]:
     """The running viewer of a command, and the assumptions about its file; ValueError for a bad file."""
-    _check_free(asked.host, asked.port)  # before the seconds that reading takes
-    model = load(asked.run)
-    check_takes_light(model, asked.lighting.is_given, asked.run)
+    _check_free(command.host, command.port)  # before the seconds that reading takes
+    model = load(command.run)
+    check_takes_light(model, command.lighting.is_given, command.run)
     notes: list[str] = []
-    reading: dict[str, Any] = {"num_points": asked.num_points, "up": asked.up, "clean": asked.clean}
-    points = clouds.read_cloud(asked.cloud, **reading, cut=asked.cut, report=notes.append)
-    first = frame.open_state(model, points, frame.display_name(asked.cloud.name), asked.lighting)
-    return Viewer(model, first, reading, asked.host, asked.port, asked.reached_at), notes
+    reading: dict[str, Any] = {"num_points": command.num_points, "up": command.up, "clean": command.clean}
+    points = clouds.read_cloud(command.cloud, **reading, cut=command.cut, report=notes.append)
+    first = frame.open_state(model, points, frame.display_name(command.cloud.name), command.lighting)
+    return Viewer(model, first, reading, command.host, command.port, command.reached_at), notes
 
 
 def _check_free(host: str, port: int) -> None:

@@ -79,8 +79,8 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
 def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list[str]:
     """The objects of a step: consecutive pieces of one new permutation of all objects per epoch."""
     positions = range(step * config.batch_objects, (step + 1) * config.batch_objects)
-    places = (divmod(position, len(names)) for position in positions)
-    return [names[epoch_order(config.seed, epoch, len(names))[place]] for epoch, place in places]
+    slots = (divmod(position, len(names)) for position in positions)
+    return [names[epoch_order(config.seed, epoch, len(names))[slot]] for epoch, slot in slots]
 
 
 @functools.lru_cache(maxsize=4)  # one batch spans few epochs, and a million objects take 20 ms to permute
@@ -237,8 +237,8 @@ def drop_materials(positions, values, rng) -> Points:
 def thin_unevenly(positions, values, rng) -> Points:
     """Density that falls exponentially along a random direction, to THINNEST."""
     along = positions @ rng.normal(size=3)
-    place = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
-    kept = rng.uniform(size=len(positions)) < THINNEST**place
+    fraction = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
+    kept = rng.uniform(size=len(positions)) < THINNEST**fraction
     kept[0] = True
     return positions[kept], {name: column[kept] for name, column in values.items()}
 

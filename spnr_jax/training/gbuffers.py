@@ -180,21 +180,21 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     even = generator.random() < config.even_share and count <= MOST_EVEN
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
     points = Cleaned(columns.pop("positions"), columns, [], 0.0)
-    alone = False
+    own_normals = False
     if generator.random() < SCANNED:
         points, count = simulate_scan(points, generator), min(count, MOST_EVEN)
     else:
         if generator.random() < UNKNOWN_MATERIALS:
             points = points._replace(values=drop_materials(*points[:2], generator)[1])
         if generator.random() < WITHOUT_NORMALS:
-            alone = generator.random() < OWN_NORMALS
-            if not alone:
+            own_normals = generator.random() < OWN_NORMALS
+            if not own_normals:
                 points.values.pop("normals", None)
     chosen = generator.permutation(len(points.positions))[:count]
     if even:
         chosen = farthest_points(points.positions, len(chosen), int(chosen[0]))
     cloud = normals.thin_cloud(points, chosen)
-    return dataclasses.replace(cloud, normals=None) if alone else cloud
+    return dataclasses.replace(cloud, normals=None) if own_normals else cloud
 
 
 def simulate_scan(points: Cleaned, generator: np.random.Generator) -> Cleaned:
@@ -314,10 +314,10 @@ def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.
             break
 
     def cut(values: np.ndarray, margin: int, scale: int) -> np.ndarray:
-        places = [(scale * (first - margin), scale * (first + inner + margin)) for first in (top, left)]
-        rows, columns = (slice(max(first, 0), max(end, 0)) for first, end in places)
+        bounds = [(scale * (first - margin), scale * (first + inner + margin)) for first in (top, left)]
+        rows, columns = (slice(max(first, 0), max(end, 0)) for first, end in bounds)
         part = values[rows, columns]
-        lacking = [(max(-f, 0), max(e - n, 0)) for (f, e), n in zip(places, values.shape, strict=False)]
+        lacking = [(max(-f, 0), max(e - n, 0)) for (f, e), n in zip(bounds, values.shape, strict=False)]
         return np.pad(part, [*lacking, (0, 0)])
 
     return {
