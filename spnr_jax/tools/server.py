@@ -208,7 +208,7 @@ class Browser:
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
-            self._status.content = self._said.content.replace(PREPARING, "")
+            self._status.content = self._status.content.replace(PREPARING, "")
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))
