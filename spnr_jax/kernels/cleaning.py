@@ -151,7 +151,7 @@ def _drop_points(
 
 
 def _is_outlier(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Strength) -> np.ndarray:
-    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBOURS)."""
+    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBORS)."""
     positions = tree.data
     mean = distances.mean(axis=1)
     expected = np.median(mean[near], axis=1)

@@ -113,7 +113,7 @@ def choose_voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
 
 
 def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
-    """The cluster index of each point, 0 for the largest; `voxel` is voxel_side by default.
+    """The cluster index of each point, 0 for the largest; `voxel` is `choose_voxel_side` by default.
 
     Ties in size are broken by the order of the clusters' first points.
     """

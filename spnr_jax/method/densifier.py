@@ -155,7 +155,7 @@ def project_to_tangent(direction: Float[Array, "m 3"], normal: Float[Array, "m 3
 
 
 def place_candidates(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Candidates:
-    """Candidates of all points, CHILDREN consecutive ones for each point."""
+    """Candidates of all points, CANDIDATES consecutive ones for each point."""
     ends, exists, directions = jax.lax.stop_gradient(propose(nodes, neighbors))
     own = jnp.broadcast_to(jnp.arange(len(ends), dtype=ends.dtype)[:, None], ends.shape)
     first, second, exists, directions = own.reshape(-1), ends.reshape(-1), exists.reshape(-1), directions.reshape(-1, 3)
@@ -384,7 +384,7 @@ def select_points(
 
 
 def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
-    """The cloud (unbatched, any units), then CHILDREN slots for each of its points; `mask` is True for the kept ones.
+    """The cloud (unbatched, any units), then CANDIDATES slots for each of its points; `mask` is True for the kept ones.
 
     Pure, of static size: jit, vmap over equally padded clouds, grad.  `params` are the model's, `neighbors` those of
     `spnr_jax.neighbors(cloud)`; find them anew for the result before `encode`.  All points of the result have normals:

@@ -33,7 +33,7 @@ RIM_ANGLES = 2 * np.pi / NUM_RIM_DIRECTIONS * np.arange(NUM_RIM_DIRECTIONS)
 
 
 def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " block"]:
-    """Spacing from the area of the disc that holds a number of neighbors on any layer; in units of the box."""
+    """Raw spacing: from the area of the disc that holds 6 neighbors on any layer; in units of the box."""
     count = jnp.minimum(const.raw_neighbors, jnp.sum(hood.real, axis=0) - 1)
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
     distance = safe_sqrt(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
@@ -45,7 +45,7 @@ def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " 
 def measure_layer_spacing(
     hood: Neighborhood, membership: Float[Array, "k block"], raw: Float[Array, " block"], const: Constants
 ) -> Float[Array, " block"]:
-    """Spacing from the area of the disc that holds a number of neighbors on the same layer; in units of the box."""
+    """Spacing from the area of the disc that holds 5.5 neighbors (by weight) on the same layer; in units of the box."""
     others = len(membership) - 1
     summed = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
     wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * summed[-1], 0.5))
@@ -61,7 +61,7 @@ def measure_layer_spacing(
 def smooth_spacing(
     membership: Float[Array, "k block"], spacings: Float[Array, "k block"], const: Constants
 ) -> Float[Array, " block"]:
-    """Geometric mean of the spacing over the nearest neighbors on the same layer."""
+    """Geometric mean of the spacing over the 9 nearest neighbors on the same layer."""
     weight, near = membership[: const.averaged_neighbors], spacings[: const.averaged_neighbors]
     return jnp.exp(sum_first(weight * jnp.log(larger(near, const.least_spacing))) / sum_first(weight))
 
