@@ -52,9 +52,9 @@ def parse(arguments: list[str]) -> Command:
     if source is not None:
         methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
-    said = io.StringIO()
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(stderr):
             return tyro.cli(
                 train | Evaluate | Render | View | Export | Share,
                 prog="spnr",
@@ -63,12 +63,12 @@ def parse(arguments: list[str]) -> Command:
             )
     except SystemExit as stop:
         if stop.code:
-            raise UserError(re.sub(BOX, " ", said.getvalue().partition("\n")[2])) from None  # without the title
+            raise UserError(re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])) from None  # without the title
         raise
 
 
 def _train_defaults(arguments: list[str]) -> Train:
-    """Those of the preset, whose network decides which options there are."""
+    """Defaults of the preset; its network determines the options."""
     preset, _ = _take_option(arguments, "--preset")
     preset = "tiny" if preset is None else preset
     if preset not in presets.PRESETS:
@@ -77,7 +77,7 @@ def _train_defaults(arguments: list[str]) -> Train:
 
 
 def _take_option(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
-    """The value of an option, None where it is not given, and the arguments without it."""
+    """The value of an option (None if not given), and the other arguments."""
     for i, argument in enumerate(arguments):
         if argument == name:
             return "".join(arguments[i + 1 : i + 2]), arguments[:i] + arguments[i + 2 :]
@@ -94,22 +94,19 @@ def run(command: Command) -> None:
 
 
 def set_up_jax(*, repeats: bool = True) -> None:
-    """Enables the compilation cache and the reuse of memory.
-
-    Work that repeats itself on a CPU uses the memory of the time before.
-    """
-    runtime.keep_programs()  # before JAX is imported
+    """Enables the compilation cache and, for repeated work on a CPU, the reuse of memory."""
+    runtime.cache_programs()  # before JAX is imported
     if repeats:
-        runtime.keep_arrays()
+        runtime.reuse_memory()
 
 
 def _make_note(cloud: Path) -> Callable[[str], None]:
-    """What tells a person the assumptions about a cloud."""
+    """A function that prints the assumptions about a cloud to stderr."""
     return lambda line: print(f"{cloud}: {line}", file=sys.stderr)
 
 
 def check_installed(command: str, package: str, extra: str) -> None:
-    """UserError if a package that the command needs is missing; the extra brings it."""
+    """UserError if a package of the command's extra is missing."""
     if importlib.util.find_spec(package) is None:
         name = package.replace("_", "-")
         raise UserError(f"spnr {command} needs the package {name}; pip install 'spnr-jax[{extra}]'")

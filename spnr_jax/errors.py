@@ -1,4 +1,4 @@
-"""The errors that a person can mend, the bugs that are ours, stops by Ctrl-C, and when a call stack is shown."""
+"""Errors that a user can fix, bugs of this project, stops by Ctrl-C, and when a call stack is shown."""
 
 import _thread
 import contextlib
@@ -21,7 +21,7 @@ AGAIN = 0.1  # seconds after which a stop that was swallowed is tried again
 
 
 class UserError(ValueError):
-    """What was asked for cannot be done; the message says what was expected, what came, and what to do."""
+    """An error that the user can fix; the message says what was expected, what was found, and what to do."""
 
 
 def require(condition: bool, message: str) -> None:
@@ -30,7 +30,7 @@ def require(condition: bool, message: str) -> None:
         raise UserError(message)
 
 
-def within(options: Any, low: float | int, high: float | int, *names: str) -> None:
+def require_within(options: Any, low: float | int, high: float | int, *names: str) -> None:
     """UserError for the first of these options that is given and smaller or larger."""
     for name in names:
         value, wanted = getattr(options, name), f"{low} or more" if high == math.inf else f"{low} to {high}"
@@ -38,9 +38,9 @@ def within(options: Any, low: float | int, high: float | int, *names: str) -> No
             raise UserError(f"--{name.replace('_', '-')}: expected {wanted}, got {value}")
 
 
-def at_least(options: Any, least: float | int, *names: str) -> None:
+def require_at_least(options: Any, least: float | int, *names: str) -> None:
     """UserError for the first of these options that is given and smaller."""
-    within(options, least, math.inf, *names)
+    require_within(options, least, math.inf, *names)
 
 
 def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
@@ -50,9 +50,9 @@ def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
 
 
 def is_bug(error: Exception) -> bool:
-    """Whether code of this project used a name that there is not: no broken file is the cause.
+    """Whether code of this project used a name that does not exist, so that no broken file is the cause.
 
-    An attribute of a JSON value is another matter: there a file holds a list, say, where an object should be.
+    A missing attribute of a JSON value is no bug: the file holds, for example, a list instead of an object.
     """
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     if not frames or frames[-1].f_globals.get("__name__", "").partition(".")[0] not in PACKAGES:
@@ -61,12 +61,12 @@ def is_bug(error: Exception) -> bool:
 
 
 def first_line(error: Exception) -> str:
-    """What an error of a library says, without the call stacks that some append; its kind if it says nothing."""
+    """First line of an error message (libraries may append call stacks); the type if there is no message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, on one line that a person can read whole; an error of the disk with its place."""
+    """An error message on one line of limited length; errors of the disk with the path."""
     said = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.strerror:
         said = f"{error.filename or 'disk'}: {error.strerror}"
@@ -76,7 +76,7 @@ def one_line(error: Exception) -> str:
 
 
 def start_command(module: str, name: str) -> None:
-    """Runs the `main` of a module; a stop while it is imported, which takes a second, is obeyed as any other."""
+    """Runs the `main` of a module; Ctrl-C also works while it is imported, which takes a second."""
     with stop_at_once(name):
         program = importlib.import_module(module)
     program.main()
@@ -84,7 +84,7 @@ def start_command(module: str, name: str) -> None:
 
 @contextlib.contextmanager
 def stop_at_once(name: str) -> Iterator[None]:
-    """Ctrl-C ends the process while libraries are loaded: nothing is lost, and exceptions crash some of them."""
+    """Ctrl-C ends the process while libraries are loaded: an exception would crash some of them."""
 
     def stop(number: int, frame: object) -> None:
         os.write(2, f"{name}: stopped\n".encode())
@@ -106,15 +106,15 @@ def spnr() -> None:
 
 
 def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
-    """Exit code of the work; an error that a person can mend is one line on stderr and code 2, a stop is code 130.
+    """Exit code of the work; an error that the user can fix is one line on stderr and code 2, a stop is code 130.
 
-    For `debug` the line stands behind the call stack.
+    With `debug`, the call stack is printed before that line.
     """
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot print stops no picture
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _stops_obeyed():
+        with _obey_stops():
             try:
                 work()
             finally:
@@ -136,11 +136,11 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
 
 
 @contextlib.contextmanager
-def _stops_obeyed() -> Iterator[None]:
-    """KeyboardInterrupt after Ctrl-C, whatever becomes of the first one.
+def _obey_stops() -> Iterator[None]:
+    """Raises KeyboardInterrupt after Ctrl-C, even if the first one is lost.
 
-    Where JAX calls Python, an exception is dropped, or becomes another (jax-ml/jax#18246, #9082).  So it is raised
-    again until it is on its way or arrives, and an error that follows a stop counts as one.
+    Where JAX calls Python, an exception may be dropped or replaced (jax-ml/jax#18246, #9082).  So it is raised again
+    until it is handled, and an error that follows a stop counts as a stop.
     """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -158,7 +158,7 @@ def _stops_obeyed() -> Iterator[None]:
 
     def insist() -> None:
         while not arrived.wait(AGAIN):
-            if not _stopping(thread):
+            if not _is_stopping(thread):
                 signal.pthread_kill(thread, signal.SIGINT)
 
     def notice(lost: "sys.UnraisableHookArgs") -> None:
@@ -183,8 +183,8 @@ def _stops_obeyed() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _stopping(thread: int) -> bool:
-    """Whether a thread handles a KeyboardInterrupt, in a `finally` say."""
+def _is_stopping(thread: int) -> bool:
+    """Whether a thread is handling a KeyboardInterrupt, for example in a `finally`."""
     found: Any = sys._current_exceptions().get(thread)
     error = found[1] if isinstance(found, tuple) else found  # Python 3.11: with type and call stack
     while error is not None and not isinstance(error, KeyboardInterrupt):

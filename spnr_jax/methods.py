@@ -26,9 +26,9 @@ from spnr_jax.presets import PRESETS
 Function = Callable[..., Any]
 
 
-def later(place: str) -> Function:
+def lazy(path: str) -> Function:
     """A function that imports "package.module:name" when it is first called, and calls it."""
-    module, _, name = place.partition(":")
+    module, _, name = path.partition(":")
 
     def call(*arguments: Any, **named: Any) -> Any:
         return getattr(importlib.import_module(module), name)(*arguments, **named)
@@ -49,15 +49,15 @@ class Method:
     """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud,
     camera, key, train)`; or its location as "package.module:Name".  Values that it sows into "losses" are added to the
     loss."""
-    init: Function = later("spnr_jax.method.inference:init")
+    init: Function = lazy("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
-    encode: Function = later("spnr_jax.method.inference:encode_volume")
+    encode: Function = lazy("spnr_jax.method.inference:encode_volume")
     """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
-    render: Function = later("spnr_jax.method.inference:draw_each")
+    render: Function = lazy("spnr_jax.method.inference:draw_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
-    prepare: Function = later("spnr_jax.training.batching:prepare")
+    prepare: Function = lazy("spnr_jax.training.batching:prepare")
     """(config, dataset, run, *, light) -> function (first step) -> iterator of batches."""
-    loss: Function = later("spnr_jax.method.inference:loss")
+    loss: Function = lazy("spnr_jax.method.inference:loss")
     """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the params in `variables`."""
     discriminator: Function | None = None
     """(config) -> Linen module (image, condition, mask) -> logits, for a loss with a discriminator."""
@@ -89,11 +89,11 @@ class Outcome(NamedTuple):
 METHODS: dict[str, Method] = {
     "surfels": Method(
         config=SurfelConfig,
-        init=later("spnr_jax.method.surfel_method:init"),
-        encode=later("spnr_jax.method.surfel_method:encode"),
-        render=later("spnr_jax.method.surfel_method:render"),
-        prepare=later("spnr_jax.training.gbuffers:prepare"),
-        loss=later("spnr_jax.training.gbuffers:loss"),
+        init=lazy("spnr_jax.method.surfel_method:init"),
+        encode=lazy("spnr_jax.method.surfel_method:encode"),
+        render=lazy("spnr_jax.method.surfel_method:render"),
+        prepare=lazy("spnr_jax.training.gbuffers:prepare"),
+        loss=lazy("spnr_jax.training.gbuffers:loss"),
         takes_light=True,
         companions=("densifier",),
         label="Surfels",
@@ -101,15 +101,15 @@ METHODS: dict[str, Method] = {
     "paper": Method(
         config=PaperConfig,
         network="spnr_jax.method.paper_method:PaperNetwork",
-        encode=later("spnr_jax.method.paper_method:encode"),
-        render=later("spnr_jax.method.paper_method:render"),
-        discriminator=later("spnr_jax.method.paper_method:discriminator"),
+        encode=lazy("spnr_jax.method.paper_method:encode"),
+        render=lazy("spnr_jax.method.paper_method:render"),
+        discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
         label="The paper's network",
     ),
 }
 
 
-GONE = "trains"  # a field of earlier versions that weights files still contain
+REMOVED_FIELD = "trains"  # a field of earlier versions that weights files still contain
 
 
 class UnknownMethod(UserError):
@@ -134,20 +134,20 @@ def register(method: Method) -> None:
 def include(source: Path | str) -> None:
     """Imports a module or a .py file that registers methods; a one-line ValueError if that fails."""
     name = str(source)
-    place = Path(name).resolve() if name.endswith(".py") else name
-    if place in _included.values():
+    location = Path(name).resolve() if name.endswith(".py") else name
+    if location in _included.values():
         return
     before = set(METHODS)
     try:
         with _working_folder():
-            _import_file(place) if isinstance(place, Path) else importlib.import_module(place)
+            _import_file(location) if isinstance(location, Path) else importlib.import_module(location)
     except (ImportError, SyntaxError, OSError) as error:
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from None
     known = METHODS.keys() - before or any(m.source.startswith(name) for m in METHODS.values())
     require(bool(known), f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
     for method in METHODS.keys() - before:
         METHODS[method] = dataclasses.replace(METHODS[method], source=name)
-    _included[name] = place
+    _included[name] = location
 
 
 @contextmanager
@@ -170,9 +170,9 @@ def _import_file(path: Path) -> None:
 
 def network(config: NetworkConfig) -> Any:
     """The Linen module for a network's config; its code is imported at the first call."""
-    made = method_of(config).network
-    assert made is not None, f"{config.method} is no Linen module"
-    return (later(made) if isinstance(made, str) else made)(config)
+    found = method_of(config).network
+    assert found is not None, f"{config.method} is no Linen module"
+    return (lazy(found) if isinstance(found, str) else found)(config)
 
 
 def method_of(config: NetworkConfig) -> Method:
@@ -198,7 +198,7 @@ def to_dict(config: TrainConfig) -> dict:
 def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
     kinds = types_of(kind)
-    values = {name: value for name, value in values.items() if f"{path}{name}" != GONE}
+    values = {name: value for name, value in values.items() if f"{path}{name}" != REMOVED_FIELD}
     for name in values:
         require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}
@@ -208,7 +208,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
         if dataclasses.is_dataclass(expected):
             require(isinstance(value, dict), f"config field {path}{name} holds {value!r}, which is no JSON object")
             if expected is NetworkConfig:
-                expected = _sizes(value.get("method"), value.get("source"), path)
+                expected = _find_config_class(value.get("method"), value.get("source"), path)
                 value = {field: inner for field, inner in value.items() if field not in ("method", "source")}
             value = from_dict(value, expected, f"{path}{name}.")
         value = tuple(value) if isinstance(value, list) else value
@@ -218,7 +218,7 @@ def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
     return kind(**arguments)
 
 
-def _sizes(name: Any, source: Any, path: str) -> type[NetworkConfig]:
+def _find_config_class(name: Any, source: Any, path: str) -> type[NetworkConfig]:
     """The config class of the network that a file names; nothing is imported for it."""
     if isinstance(name, str) and name in METHODS:
         return METHODS[name].config

@@ -124,7 +124,7 @@ SETTING_UP = """
 import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import runtime
-runtime.keep = lambda: print("kept", end=" ")
+runtime.keep_freed_memory = lambda: print("kept", end=" ")
 cli.RUN = dict.fromkeys(cli.RUN, lambda command: None)
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)
@@ -217,7 +217,7 @@ def test_a_sparse_cloud_is_drawn_with_learned_points_unless_they_are_declined(tm
     for option in ((), ("--no-densify",)):
         arguments = ("render", tmp_path / "ball.xyz", "--run", tiny_surfels.run(), "--out", tmp_path, "--up", "y")
         assert exit_code(*arguments, *option) == 0, capsys.readouterr().err
-    counts = [[int(np.sum(np.asarray(s.mask & (s.invented > low)))) for low in (-1, 0)] for s in drawn]
+    counts = [[int(np.sum(np.asarray(s.mask & (s.learned > low)))) for low in (-1, 0)] for s in drawn]
     assert counts[0][0] == counts[0][1] + 40
     assert counts[0][1] > 20
     assert counts[1] == [40, 0]

@@ -1,4 +1,4 @@
-"""A data set from its plan: what is missing is made by workers (devices/runtime.py), then the lists are written.
+"""A data set from its plan: what is missing is made by workers (workers.py), then the lists are written.
 
 Products are made first, split, and then the colour variants of those that train (plan/tasks.py). A run may stop
 anywhere: finished objects stay, and the same command makes the others, to the same bytes. dataset.json
@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from data_gen import procedural
 from data_gen.make.objects import Workbench, make_and_write
+from data_gen.make.workers import run_tasks
 from data_gen.plan.tasks import PAPER_COUNTS, GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
 from data_gen.render import light
 from data_gen.render.variant import choose_variant, mitsuba_module
 from data_gen.store import layout
 from data_gen.store.check import checksum_of
-from spnr_jax.devices.runtime import run_tasks
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap

@@ -24,7 +24,7 @@ import tyro
 from data_gen import procedural
 from data_gen.plan import sources
 from data_gen.plan.sources import Category
-from spnr_jax.errors import UserError, at_least
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import meshes
 from spnr_jax.formats.surface_points import Spread
 
@@ -157,9 +157,9 @@ def rank(ids: Sequence[str], seed: int, purpose: str) -> list[str]:
 
 def check_options(config: GenerateConfig) -> None:
     """ValueError, naming the option, for a value that no data set can be made with."""
-    at_least(config, 2, "max_depth")
-    at_least(config, 1, "resolution", "views", "points", "spp", "visibility_grid", "train_objects", "workers")
-    at_least(config, 0, "objects", "colour_variants", "test_objects", "seed")
+    require_at_least(config, 2, "max_depth")
+    require_at_least(config, 1, "resolution", "views", "points", "spp", "visibility_grid", "train_objects", "workers")
+    require_at_least(config, 0, "objects", "colour_variants", "test_objects", "seed")
     if not 0 < config.fov < 180:
         raise UserError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
     if not config.distance > 1:

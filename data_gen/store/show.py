@@ -11,7 +11,7 @@ import tyro
 
 from data_gen.render import views
 from data_gen.store import check, layout
-from spnr_jax.errors import UserError, at_least
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, on_white
 from spnr_jax.formats.images import png_url, template, write_whole
@@ -37,7 +37,7 @@ class ShowConfig:
 def show(config: ShowConfig) -> Path:
     """Write the contact sheet; return its path."""
     check.read_description(config.dataset)
-    at_least(config, 1, "objects")
+    require_at_least(config, 1, "objects")
     object_ids = sorted(layout.list_completed(config.dataset))
     if not object_ids:
         raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")

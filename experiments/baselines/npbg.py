@@ -30,7 +30,7 @@ from spnr_jax.config import (
 )
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import bilinear
+from spnr_jax.kernels.imaging import resize_bilinear
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.nn.convolution import conv
@@ -164,7 +164,7 @@ def half(x: Float[Array, "batch height width c"]) -> Float[Array, "batch h w c"]
     """Averages over squares of 2 x 2 pixels; an odd side is first made even by a bilinear resize."""
     height, width = (side // 2 for side in x.shape[1:3])
     if x.shape[1:3] != (2 * height, 2 * width):
-        x = bilinear(x, 2 * height, 2 * width)
+        x = resize_bilinear(x, 2 * height, 2 * width)
     return jnp.mean(x.reshape(x.shape[0], height, 2, width, 2, x.shape[-1]), axis=(2, 4))
 
 
@@ -185,7 +185,7 @@ class RefinementNet(nn.Module):
             x = jnp.concatenate([x, image], axis=-1)
         x = GatedConv(self.encoder_widths[-1], name="centre")(x)
         for i, (skip, width) in enumerate(zip(reversed(skips), self.decoder_widths, strict=True)):
-            x = jnp.concatenate([bilinear(x, *skip.shape[1:3]), skip], axis=-1)
+            x = jnp.concatenate([resize_bilinear(x, *skip.shape[1:3]), skip], axis=-1)
             x = GatedConv(width, name=f"up_{len(skips) - i}")(x)
         return nn.Dense(3, bias_init=nn.initializers.constant(0.5), name="out")(x)
 

@@ -45,12 +45,12 @@ class Method:
 
     def show(self, item: ObjectData) -> Pictures:
         """The pictures."""
-        return evaluation.on_host(self.draw(self.encode(item), item))
+        return evaluation.to_numpy(self.draw(self.encode(item), item))
 
 
 def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
-    show = evaluation.network(variables, training)
+    show = evaluation.make_method(variables, training)
     return Method(
         draw=lambda _, item: show(item.cloud, item.camera),
         compiles=True,
@@ -89,7 +89,7 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
 
 def of_floor(name: str, factor: float = 1.0) -> Method:
     """A trivial renderer with the radius of its points, in point spacings."""
-    show = evaluation.floor(name, factor)
+    show = evaluation.make_floor(name, factor)
     return Method(
         draw=lambda _, item: show(item.cloud, item.camera),
         compiles=True,

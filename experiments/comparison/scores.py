@@ -23,14 +23,15 @@ from experiments.comparison import figures
 from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cut
+from experiments.comparison.view_scores import measure_sharpness
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels import metrics
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.picture_scores import Scores, flip, sharpness
-from spnr_jax.scoring.report import Cell, mean_row
+from spnr_jax.scoring.picture_scores import Scores, flip, interval
+from spnr_jax.scoring.report import Cell, number
 
 Measured = tuple[dict[str, Any], np.ndarray]  # what is measured of an object, and its first picture
 Measure = Callable[[ObjectData], Measured]
@@ -106,7 +107,7 @@ def enlarge(pictures: Pictures, size: tuple[int, ...]) -> Pictures:
 def score_view(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """The scores of COLUMNS of a picture beside its reference (RGBA, straight alpha); NaN where nothing is measured."""
     white = over_white(reference)
-    return sharpness(image, opacity, reference)._asdict() | {
+    return measure_sharpness(image, opacity, reference)._asdict() | {
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
         "flip": float(flip(image, white)),
         "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
@@ -133,9 +134,14 @@ def score_row(
     columns: Mapping[str, tuple[str, int]] = COLUMNS,
     sign: str = "",
 ) -> tuple[str, tuple[Cell, ...]]:
-    """Means over objects with intervals."""
-    values = [[of.get(name) for name in columns] for of in objects]
-    return mean_row(label, values, [decimals for _, decimals in columns.values()], sign)
+    """A row of means over objects with intervals; None and NaN are left out."""
+    cells = []
+    for name, (_, decimals) in columns.items():
+        values = np.array([of.get(name) for of in objects], float)
+        known = values[~np.isnan(values)]
+        mean, ends = (float(known.mean()), interval([x[None] for x in known])) if len(known) else (None, None)
+        cells.append(number(mean, decimals, ends, sign=sign))
+    return label, tuple(cells)
 
 
 def gallery(
@@ -189,7 +195,7 @@ def score_objects(
     `more` scores a method's pictures of an object in other ways, too.
     """
     seconds: dict[str, list[float]] = {method: [] for method in methods}
-    scores, shown, to_show = {}, [], evaluation.spread(names, num_shown)
+    scores, shown, to_show = {}, [], evaluation.pick_evenly(names, num_shown)
     for name in tqdm(names, desc="scoring"):
         item = data_sets.read_object(dataset, name)
         item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))

@@ -11,7 +11,7 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import mean_of_squares
+from spnr_jax.kernels.imaging import average_pool
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
 
@@ -23,7 +23,7 @@ def test_objects(dataset: Dataset, count: int | None) -> tuple[str, ...]:
         raise UserError(f"{dataset.folder}: the test split is empty; generate more objects")
     if count is not None and count < 1:
         raise UserError(f"--objects: expected 1 or more, got {count}")
-    return evaluation.spread(names, count or len(names))
+    return evaluation.pick_evenly(names, count or len(names))
 
 
 def cut(
@@ -55,7 +55,7 @@ def shrink(rgba: np.ndarray, side: int) -> np.ndarray:
     """8-bit pictures averaged over squares of `side` pixels, colours weighted by their opacity."""
     pictures = rgba.astype(np.float32) / 255
     weighted = np.concatenate([pictures[..., :3] * pictures[..., 3:], pictures[..., 3:]], axis=-1)
-    weighted = np.asarray(mean_of_squares(jnp.asarray(weighted), side))
+    weighted = np.asarray(average_pool(jnp.asarray(weighted), side))
     return to_uint8(np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], -1))
 
 

@@ -23,7 +23,7 @@ from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
-from spnr_jax.errors import UserError, at_least
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
@@ -58,7 +58,7 @@ class Budget:
     def __post_init__(self) -> None:
         if self.steps is not None and (self.quick or self.steps < 1):
             raise UserError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
-        at_least(self, 1, "shown")
+        require_at_least(self, 1, "shown")
 
     def config(self) -> TrainConfig:
         """The preset with the steps and the seed of this budget."""
@@ -193,7 +193,7 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
     """What the numbers stand on."""
     counts = {f"{split} objects": len(objects) for split, objects in dataset.splits.items()}
     return {
-        "hardware": runtime.hardware(),
+        "hardware": runtime.describe_hardware(),
         "data": dataset.settings.get("settings", {}) | counts,
         "test_objects": list(names),
         "points": config.test_points,

@@ -31,9 +31,9 @@ from spnr_jax.formats.surface_points import normalise, sample_surface
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.densifier import CHILDREN, Nodes, Places, blend, build_graph, init, predict, turn
+from spnr_jax.method.densifier import CANDIDATES, Candidates, Nodes, build_graph, init, predict, rotate, weigh_rows
 from spnr_jax.surfels import geometry, sides
-from spnr_jax.surfels.geometry import Points, order_in_space
+from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
@@ -134,8 +134,8 @@ def find_outside(
 def count_sides(position: Array, normal: Array, spacing: Array) -> tuple[Array, Array]:
     """How many directions see each point from before and from behind."""
     mask = jnp.ones(position.shape[1], bool)
-    points = Points(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
-    return sides.count_facing(normal, geometry.estimate_visibility(points, normal, spacing))
+    points = PointColumns(jnp.zeros((1, len(mask)), jnp.int32), mask, mask, position, position)
+    return sides.sum_visibility(normal, geometry.estimate_visibility(points, normal, spacing))
 
 
 _see = jax.jit(build_graph, compiler_options=QUICKEST)
@@ -152,7 +152,7 @@ def make_cloud(
     cloud = PointCloud(positions=places[order], mask=np.ones(count, bool), **columns)
     neighbors = np.pad(near, [(0, size - count), (0, 0)], constant_values=-1)
     nodes, found = jax.device_get(_see(cloud_arrays.pad(cloud, size), neighbors))
-    kept = np.flatnonzero(found.exists[: CHILDREN * count])
+    kept = np.flatnonzero(found.exists[: CANDIDATES * count])
     arrays = {name: values[:count] for name, values in nodes._asdict().items()}
     arrays |= {f"place_{name}": values[kept] for name, values in found._asdict().items()}
     dense = true_position[: min(DENSER * count, TRUTH)]
@@ -189,7 +189,7 @@ class Batch(NamedTuple):
 
     nodes: Nodes
     neighbors: Any
-    places: Places
+    places: Candidates
     truth: Truth
 
 
@@ -238,7 +238,7 @@ def cut(record: dict[str, np.ndarray], number: int, most: int, rng: np.random.Ge
     of_asked = (record[name][true] for name in ("position", "normal", "visible"))
     compared = (*at_places, floor, *of_asked, site[get["nearest"][asked]], point[get["parents"][asked]])
     truth = Truth(*compared)
-    return Batch(nodes, point[near[used]], Places(**rows), truth), count
+    return Batch(nodes, point[near[used]], Candidates(**rows), truth), count
 
 
 def mirror(part: Batch) -> Batch:
@@ -280,7 +280,7 @@ def join(parts: list[Batch]) -> Batch:
 
     given, places, truth = joined.nodes, joined.places, joined.truth
     points = Nodes(*(pad(x, NODES) for x in given))._replace(spacing=pad(given.spacing, NODES, 1))
-    padded = Places(*(pad(x, PLACES) for x in places))
+    padded = Candidates(*(pad(x, PLACES) for x in places))
     padded = padded._replace(scale=pad(places.scale, PLACES, 1), around=pad(places.around, PLACES, -1))
     nearest = pad(truth.nearest, QUERIES, -1)
     true: tuple[Any, ...] = (*(pad(x, PLACES) for x in truth[:5]), *(pad(x, QUERIES) for x in truth[5:8]))
@@ -295,7 +295,7 @@ def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """(loss, metrics): children on the surface, true points near a child, existence, normals, colors."""
     nodes, places, truth = batch.nodes, batch.places, batch.truth
     children = predict(params, nodes, batch.neighbors, places)
-    shift = turn(children.offset, places.frame)
+    shift = rotate(children.offset, places.frame)
     weight = places.exists * (HIDDEN + (1 - HIDDEN) * jnp.mean(truth.visible[:, :4].astype(jnp.float32), axis=1))
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
     way = (truth.position - places.middle[:, None]) / places.scale[:, None, None]
@@ -311,12 +311,12 @@ def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     beyond = jax.nn.relu(beside - truth.floor)
     off = jnp.sqrt(height**2 + beyond**2 + 1e-4) - 0.01
     cosine = jnp.sum(children.normal * at_goal, axis=-1)
-    likely = jax.nn.sigmoid(children.odds)
+    likely = jax.nn.sigmoid(children.logit)
     quality = jnp.exp(-0.5 * (off / EXACT) ** 2) * jnp.clip((cosine - 0.2) / 0.5, 0, 1)
     quality = jax.lax.stop_gradient(quality)
-    existence = optax.sigmoid_binary_cross_entropy(children.odds, quality)
+    existence = optax.sigmoid_binary_cross_entropy(children.logit, quality)
     certain = jax.lax.stop_gradient(0.2 + 0.8 * likely) * weight
-    color = blend(children.shares, nodes.color[places.around])
+    color = weigh_rows(children.weights, nodes.color[places.around])
     true_color = jnp.take_along_axis(truth.color, match[..., None], axis=1)[:, 0].astype(jnp.float32) / 255
     parts = {
         "child": jnp.sum(certain * ROBUST * jnp.log1p(off / ROBUST)),

@@ -23,6 +23,7 @@ from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from experiments import entry_point
 from experiments.comparison.contenders import draw_volume
+from experiments.comparison.view_scores import measure_sharpness
 from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
 from spnr_jax import cli, presets
@@ -32,7 +33,6 @@ from spnr_jax.formats.images import write_whole
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.picture_scores import sharpness
 from spnr_jax.training import trainer
 from spnr_jax.training.weights import load
 
@@ -151,7 +151,7 @@ def score_object(
     """The scores COLUMNS of an object, means over its views, each in its own light."""
     pictures = draw_volume(model, model.encode(cloud, densify=densify), item, quality)
     drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images.astype(np.float32) / 255, strict=True)
-    found = [[getattr(one, name) for name in COLUMNS] for one in (sharpness(*view) for view in drawn)]
+    found = [[getattr(one, name) for name in COLUMNS] for one in (measure_sharpness(*view) for view in drawn)]
     return np.nanmean(found, axis=0).tolist()
 
 

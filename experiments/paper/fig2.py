@@ -81,7 +81,7 @@ def variants_picture(dataset: data_sets.Dataset, num_objects: int) -> bytes:
         if name != original(name):
             found.setdefault(original(name), []).append(name)
     rows, most = [], min(MOST_SHOWN, max(map(len, found.values())))
-    for product in evaluation.spread(tuple(p for p in found if len(found[p]) >= most), num_objects):
+    for product in evaluation.pick_evenly(tuple(p for p in found if len(found[p]) >= most), num_objects):
         items = [data_sets.read_object(dataset, name) for name in (product, *found[product][:most])]
         views = nearest_views([np.asarray(item.camera.cam_to_world)[..., 3] for item in items])
         images = [data_sets.on_white(item.images[view]) for item, view in zip(items, views, strict=True)]

@@ -84,14 +84,14 @@ def main(options: Fig3) -> None:
     asked = {"runs": list(found), "points": options.points, "objects": names}
     results_folder.claim(options.out, "depths", asked, dataset)
     rows = {name: partial(measure, options.points, method) for name, method in found.items()}
-    shown = evaluation.spread(names, options.shown)
+    shown = evaluation.pick_evenly(names, options.shown)
     measured = scores.measure_rows(options.out, rows, dataset, names, shown)
     table = Table(
-        title=f"{len(names)} unseen objects, {options.points} points; {runtime.hardware()}",
+        title=f"{len(names)} unseen objects, {options.points} points; {runtime.describe_hardware()}",
         heads=tuple(head for head, _ in COLUMNS.values()),
         rows=tuple(scores.score_row(name, objects, COLUMNS) for name, objects in measured.items()),
     )
-    results = asked | {"scores": measured, "hardware": runtime.hardware()}
+    results = asked | {"scores": measured, "hardware": runtime.describe_hardware()}
     results["data"] = dataset.settings.get("settings", {})
     picture = scores.gallery(options.out, rows, dataset, shown, None, 128)
     results_folder.write(options.out, results, [table], [NOTE], {"fig3_depth.png": picture})

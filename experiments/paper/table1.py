@@ -31,7 +31,7 @@ from experiments.comparison.study_objects import test_objects
 from experiments.comparison.variants import QUICK_STEPS, Trained, Variant
 from spnr_jax import cli
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, at_least
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.report import Cell, Table, duration, number, text
@@ -80,7 +80,7 @@ class Table1:
     def __post_init__(self) -> None:
         if not self.methods:
             raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
-        at_least(self, 1, "objects", "shown")
+        require_at_least(self, 1, "objects", "shown")
 
 
 def main(options: Table1) -> None:

@@ -27,7 +27,7 @@ from experiments import entry_point
 from experiments.comparison import results_folder
 from spnr_jax.config import EncoderConfig, LossConfig, OptimizerConfig, PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.devices import runtime
-from spnr_jax.errors import at_least
+from spnr_jax.errors import require_at_least
 from spnr_jax.kernels.records import Batch, Camera, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.scoring.report import Table, number, text
@@ -64,7 +64,7 @@ class Options:
     """A check that everything works: tiny, two rounds, short turns, into OUT-quick."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "threads")
+        require_at_least(self, 1, "rounds", "threads")
 
 
 def main(options: Options) -> None:
@@ -73,16 +73,16 @@ def main(options: Options) -> None:
         out = options.out.with_name(f"{options.out.name}-quick")
         options = dataclasses.replace(options, out=out, presets=("tiny",), rounds=2, seconds=0.1)
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
-    runtime.keep_arrays()
-    load, rows = runtime.load(), rows_of(options)
-    note = f"{runtime.hardware()}, load before {load}; {time.strftime('%Y-%m-%d')}"
+    runtime.reuse_memory()
+    load, rows = runtime.measure_load(), rows_of(options)
+    note = f"{runtime.describe_hardware()}, load before {load}; {time.strftime('%Y-%m-%d')}"
     results_folder.write(options.out, {"rows": rows}, [table(rows)], [note])
 
 
 def rows_of(options: Options) -> list[Row]:
     """All rows of these options; those that were missing are measured now."""
     asked = {name: getattr(options, name) for name in ("rounds", "seconds", "threads")}
-    results_folder.claim(options.out, "times beside the twin", asked | {"hardware": runtime.hardware()})
+    results_folder.claim(options.out, "times beside the twin", asked | {"hardware": runtime.describe_hardware()})
     variants: tuple[str | None, ...] = options.variants
     if importlib.util.find_spec("torch") is None:
         print("torch is not installed (pip install -c constraints.txt -e '.[bench]'): ours is timed alone")

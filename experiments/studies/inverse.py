@@ -47,14 +47,14 @@ from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.scoring.report import Table, number
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.geometry import fit_box
-from spnr_jax.surfels.lighting import directions, solid_angles
+from spnr_jax.surfels.lighting import solid_angles, texel_directions
 
 TURN, SHIFT, MOVED = np.deg2rad(8.0), 0.1, 0.5  # of a wrong pose, in radians and radii; of points, in spacings
 GREY = 0.5  # where materials begin
 SHOWN = 0.01  # of the largest gradient by a point's colour, above which the picture shows the point
 SMOOTHEST = 0.05  # the least roughness
 ROOM = 1.25  # of what the true pictures need, for what moves
-HELD = ("visible", "sided", "mask")  # fields of surfels that have no gradient
+HELD = ("visibility", "one_sided", "mask")  # fields of surfels that have no gradient
 DIFFERENCE = 1e-8  # of central differences in float64: the smaller, the fewer of them cross an edge
 ADAM = optax.scale_by_adam()
 RATES: Mapping[str, Mapping[str, float]] = {  # of Adam at the first step, falling to 0
@@ -120,7 +120,7 @@ def main(options: InverseStudy) -> None:
     rows = ["target", *(f"{task}, {when}" for task in RATES for when in ("start", "end"))]
     files = {"inverse.png": images.png(figures.grid(sheet, list(objects), rows, 2 * size))}
     asked = {"points": truth.cloud.mask.shape[1], "size": size, "steps": steps, "plan": plan._asdict()}
-    asked |= {"hardware": runtime.hardware(), "load": runtime.load()}
+    asked |= {"hardware": runtime.describe_hardware(), "load": runtime.measure_load()}
     note = f"{asked['points']} points, {size} px, {steps} steps; {asked['hardware']}, load {asked['load']}."
     results = asked | {"objects": list(objects), "tasks": found, "gradients": checks}
     results_folder.write(options.out, results, make_tables(found, checks, list(objects)), [note], files)
@@ -172,7 +172,7 @@ def place(cloud: PointCloud, number_of: int, size: int) -> Truth:
 
 def harmonics() -> Float[np.ndarray, "32 64 9"]:
     """The first nine real spherical harmonics at the texels of a light's map."""
-    towards = np.moveaxis(directions(lighting.HEIGHT).astype(np.float32), -1, 0)
+    towards = np.moveaxis(texel_directions(lighting.HEIGHT).astype(np.float32), -1, 0)
     return np.stack([np.asarray(x) for x in lighting.harmonics(*map(jnp.asarray, towards))], axis=-1)
 
 

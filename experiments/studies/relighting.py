@@ -147,7 +147,7 @@ def _write(out: Path, found: Found) -> None:
         rows=tuple(scores.score_row(label, objects, COLUMNS) for label, objects in rows.items()),
         note="Means over objects with 95 % intervals; pictures are never rescaled.",
     )
-    results_folder.write(out, {"objects": rows, "hardware": runtime.hardware()}, [table])
+    results_folder.write(out, {"objects": rows, "hardware": runtime.describe_hardware()}, [table])
 
 
 if __name__ == "__main__":

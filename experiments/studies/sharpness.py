@@ -30,6 +30,7 @@ from experiments.comparison.contenders import Method
 from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
 from experiments.comparison.study_objects import cut
+from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
@@ -39,7 +40,6 @@ from spnr_jax.kernels.cloud_arrays import plain_cloud
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.picture_scores import WELL_INSIDE, sharpness
 from spnr_jax.scoring.report import Cell, Table, number
 
 COLUMNS = {
@@ -104,7 +104,9 @@ def main(options: SharpnessStudy) -> None:
         rows=tuple(_row(row, objects, known[row]) for row, objects in found.items()),
         note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
     )
-    results_folder.write(options.out, {"objects": found, "known": known, "hardware": runtime.hardware()}, [table])
+    results_folder.write(
+        options.out, {"objects": found, "known": known, "hardware": runtime.describe_hardware()}, [table]
+    )
 
 
 def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectData) -> Measured:
@@ -154,7 +156,7 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True):
         reference = rgba.astype(np.float32) / 255
         right = under_true_opacity(np.asarray(image), np.asarray(opacity), reference)
-        found.append(sharpness(right, reference[..., 3], reference))
+        found.append(measure_sharpness(right, reference[..., 3], reference))
     return {
         "psnr_true_opacity": [one.psnr for one in found],
         "inside_true_opacity": [one.psnr_inside for one in found],

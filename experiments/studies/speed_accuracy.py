@@ -200,7 +200,12 @@ def main(options: SpeedAccuracy) -> None:
     telling = sorted(rows, key=lambda row: row.setting.group != "level")  # the most telling ones first
     measured = scores.measure_rows(options.out, {row.place: row.measure for row in telling}, dataset, names)
     found = [row.summary(measured[row.place]) for row in rows]
-    whole = {"hardware": runtime.hardware(), "load": runtime.load(), "date": time.strftime("%Y-%m-%d"), "rows": found}
+    whole = {
+        "hardware": runtime.describe_hardware(),
+        "load": runtime.measure_load(),
+        "date": time.strftime("%Y-%m-%d"),
+        "rows": found,
+    }
     sizes = [of for size in options.sizes if (of := [row for row in found if row["size"] == size])]
     fronts = [(of, front(of)) for of in sizes]
     tables = [table(of, chosen) for of, chosen in fronts]

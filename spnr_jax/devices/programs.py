@@ -1,13 +1,12 @@
-"""How programs of JAX run: over all devices, and from traces that are kept on the disk beside XLA's programs.
+"""How programs of JAX run: over all devices, and from traces that are cached on disk beside XLA's programs.
 
-Many devices are a mesh, over which the objects of a batch are divided.  The program is the one of a single device:
-placed inputs and the mesh in use are all that differs, and XLA adds the communication.  Parameters and optimisers are
-on every device whole.  Where a program packs rays by what they meet (`voxels.map_existing`), each device packs those
-of its own objects (`split_objects`): XLA would let all of them compute all.
+Several devices form a mesh, over which the objects of a batch are divided.  The program is that of a single device:
+placed inputs and the active mesh are the only differences, and XLA adds the communication.  Parameters and optimisers
+are replicated.  Where a program packs rays by what they hit (`voxels.map_existing`), each device packs those of its own
+objects (`split_objects`): otherwise XLA would let every device compute all of them.
 
-With kept traces (`Kept`) a new process neither traces nor compiles; both take Python as long as the rest of a second
-run.  A trace is a function that `jax.export` has written, named by what it depends on: shapes, static arguments, the
-package's sources, JAX and the platform.
+With cached traces (`CachedProgram`), a new process neither traces nor compiles.  A trace is a function that
+`jax.export` has written; its name depends on shapes, static arguments, the package's sources, JAX and the platform.
 """
 
 import contextlib
@@ -35,18 +34,18 @@ OBJECTS = "objects"
 
 
 def device_mesh() -> Mesh | None:
-    """All devices in one axis; None if there is one alone."""
+    """All devices in one axis; None for a single device."""
     count = jax.device_count()
     return jax.make_mesh((count,), (OBJECTS,), axis_types=(AxisType.Auto,)) if count > 1 else None
 
 
-def using(mesh: Mesh | None) -> AbstractContextManager:
-    """The context in which jitted functions are called that compute on the mesh; nothing without one."""
+def use_mesh(mesh: Mesh | None) -> AbstractContextManager:
+    """Context in which jitted functions compute on the mesh; does nothing for None."""
     return nullcontext() if mesh is None else jax.set_mesh(mesh)
 
 
-def sharding_of_all(mesh: Mesh) -> NamedSharding:
-    """The sharding of what every device holds whole."""
+def replicated_sharding(mesh: Mesh) -> NamedSharding:
+    """The sharding of arrays that every device holds whole."""
     return NamedSharding(mesh, PartitionSpec())
 
 
@@ -65,23 +64,23 @@ def place_batch(batch: Any, mesh: Mesh | None) -> Any:
 
 
 def on_first_device(tree: Any) -> Any:
-    """What every device holds whole, as arrays of one device."""
+    """Replicated arrays as arrays of one device."""
     return jax.tree.map(lambda x: x.addressable_data(0), tree)
 
 
 def object_groups(count: int) -> int:
-    """How many groups the mesh in use divides so many objects into; 1 without a mesh, or if it does not divide them."""
+    """Number of groups that the active mesh divides the objects into; 1 without a mesh, or if it cannot divide them."""
     mesh = jax.sharding.get_abstract_mesh()
-    groups = mesh.size if OBJECTS in mesh.auto_axes else 1  # within `split_objects` each device has its own already
+    groups = mesh.size if OBJECTS in mesh.auto_axes else 1  # within `split_objects`, each device already has its own
     return 1 if count % groups else groups
 
 
 def split_objects(function: Callable[..., Any], whole: Any, *parts: Any) -> Any:
-    """`function(whole, *parts)`, in which each device of the mesh in use has its own objects alone.
+    """`function(whole, *parts)`, where each device of the active mesh has only its own objects.
 
-    Arrays of the parts and of what is returned have objects first; `whole` is what all share.
+    Arrays of the parts and of the result have objects first; `whole` is shared by all.
     """
-    if object_groups(jax.tree.leaves(parts)[0].shape[0]) == 1:  # also of the one object that makes a network's weights
+    if object_groups(jax.tree.leaves(parts)[0].shape[0]) == 1:  # also for the one object that initialises a network
         return function(whole, *parts)
     specs = (PartitionSpec(), *[PartitionSpec(OBJECTS)] * len(parts))
     # unchecked: a scan that starts from a constant is refused, although all results differ by device
@@ -89,17 +88,17 @@ def split_objects(function: Callable[..., Any], whole: Any, *parts: Any) -> Any:
     return divided(whole, *parts)
 
 
-# --- kept traces ------------------------------------------------------------------------------------------------------
+# --- cached traces ----------------------------------------------------------------------------------------------------
 
 
 DIGEST = hashlib.sha256().digest_size
 _registered: set[type] = set()
 
 
-class Kept:
-    """A function under `jax.jit` whose traces are kept; for arrays of the host, calls in other traces pass it by."""
+class CachedProgram:
+    """A function under `jax.jit` whose traces are cached; calls with tracers or sharded arrays bypass the cache."""
 
-    all: ClassVar[list[Self]] = []
+    instances: ClassVar[list[Self]] = []
 
     def __init__(
         self,
@@ -109,17 +108,17 @@ class Kept:
         static: str | tuple[str, ...] = (),
         options: dict[str, Any] | None = None,
     ) -> None:
-        """`returns`: classes of the records that it gives; `static`: its static keyword arguments; `options`: XLA's."""
+        """`returns`: classes of the returned records; `static`: static keyword arguments; `options`: XLA's."""
         functools.update_wrapper(self, function)
         for record in returns:
             _register(record)
         self.function, self.options = function, options
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self.programs: dict[Any, Callable[..., Any]] = {}
-        Kept.all.append(self)
+        CachedProgram.instances.append(self)
 
     def __call__(self, *args: Any, **static: Any) -> Any:
-        """What the function gives."""
+        """The result of the function."""
         leaves, tree = jax.tree.flatten(args)
         if not all(_is_plain(leaf) for leaf in leaves):
             return self.jitted(*args, **static)
@@ -130,19 +129,19 @@ class Kept:
         return self.programs[key](*leaves)
 
     def _program(self, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> Callable[..., Any]:
-        """A function of the leaves: from a trace where programs are kept on the disk."""
-        place = jax.config.values["jax_compilation_cache_dir"]
-        if place is None:
+        """A function of the leaves; from a trace if programs are cached on disk."""
+        folder = jax.config.values["jax_compilation_cache_dir"]
+        if folder is None:
             return lambda *leaves: self.jitted(*jax.tree.unflatten(tree, leaves), **static)
-        trace = self._load(Path(place), tree, leaves, static, key)
+        trace = self._load(Path(folder), tree, leaves, static, key)
         return jax.jit(trace.call, compiler_options=self.options)
 
-    def _load(self, place: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
-        """The trace for such arguments: that on the disk, or a new one, which is written there."""
+    def _load(self, folder: Path, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> export.Exported:
+        """The trace for these arguments: from disk, or a new one, which is written to disk."""
         name = self.function.__name__
         versions = jax.__version__, jax.default_backend(), jax.config.values["jax_enable_x64"]
         depends = repr((self.function.__module__, name, versions, key)).encode() + _digest_sources()
-        file = place / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
+        file = folder / f"trace-{name}-{hashlib.sha256(depends).hexdigest()}"
         with contextlib.suppress(OSError):
             written = file.read_bytes()
             if hashlib.sha256(written[DIGEST:]).digest() == written[:DIGEST]:
@@ -151,8 +150,8 @@ class Kept:
         flat = jax.jit(lambda *leaves: self.function(*jax.tree.unflatten(tree, leaves), **static))
         trace = export.export(flat)(*shapes)
         content = bytes(trace.serialize())
-        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written: it is traced again
-            place.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # disk full or folder read-only: it is traced again next time
+            folder.mkdir(parents=True, exist_ok=True)
             unfinished = file.with_name(f".unfinished-{os.getpid()}-{file.name}")
             unfinished.write_bytes(hashlib.sha256(content).digest() + content)
             os.replace(unfinished, file)
@@ -172,12 +171,12 @@ def make_room() -> None:
     with contextlib.suppress(OSError):  # another system
         if MAPS.read_bytes().count(b"\n") > FULL * int(MOST_MAPS.read_text()):
             jax.clear_caches()
-            for kept in Kept.all:
+            for kept in CachedProgram.instances:
                 kept.programs.clear()
 
 
 def _is_plain(leaf: Any) -> bool:
-    """Whether it is an array on the host or on one device."""
+    """Whether it is an array on the host or on a single device."""
     if isinstance(leaf, jax.core.Tracer):
         return False
     return isinstance(leaf, np.ndarray) or (isinstance(leaf, jax.Array) and len(leaf.devices()) == 1)
@@ -195,7 +194,7 @@ def _digest_sources() -> bytes:
 
 
 def _register(record: type) -> None:
-    """Tells `jax.export` of a record, once."""
+    """Registers a record with `jax.export`, once."""
     if record in _registered:
         return
     _registered.add(record)

@@ -31,14 +31,14 @@ from spnr_jax.kernels.cleaning import Clean, clean_columns
 from spnr_jax.kernels.cloud_arrays import (
     THINNING,
     farthest_points,
+    measure_spacing,
     merge_repeats,
     require_surface,
     sample_stream,
-    spacing,
     stack_columns,
 )
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.surfels.normals import facing, outward_normals, planes
+from spnr_jax.surfels.normals import estimate_normals, face_sensor, outward_normals
 
 __all__ = ("MESHES", "PlacedCloud", "cloud_of_ply", "place_cloud", "read_cloud")
 
@@ -150,7 +150,7 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
     points = _sample_mesh(path, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
-    rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
+    rows, lines = scenes.select_object(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
         positions, values, done, noise = clean_columns(points.positions, points.values, how.clean)
@@ -170,7 +170,7 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
         kept = np.sort(farthest_points(points.positions, count, how.seed))
     fewer = points.take(kept)
     if "normals" not in points.values and sensor:
-        fewer.values["normals"] = facing(fewer.positions, points.positions, sensor.place - points.origin, noise)
+        fewer.values["normals"] = face_sensor(fewer.positions, points.positions, sensor.place - points.origin, noise)
         how.report("normals turned to the place of the sensor")
     elif "normals" not in points.values and len(kept) < len(points.positions):
         fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
@@ -228,7 +228,7 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
 
 def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
+    from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
     from spnr_jax.formats.surface_points import bounding_box, sample_surface
 
     cut, report = how.cut, how.report
@@ -255,8 +255,8 @@ def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
     if not cut.crop:
         return points
     whole = points.positions + origin
-    inside = scenes.in_box(whole, cut.crop)
-    report(scenes.crop_box(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
+    inside = scenes.is_inside(whole, cut.crop)
+    report(scenes.describe_crop(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
     return points.take(inside)
 
 
@@ -276,7 +276,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
                 positions = stack_columns(columns)
                 low = np.minimum(low, positions[wanted].min(axis=0, initial=np.inf))
                 high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
-                inside = scenes.in_box(positions, cut.crop)
+                inside = scenes.is_inside(positions, cut.crop)
                 outside += int(np.count_nonzero(wanted & ~inside))
                 wanted = wanted & inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
@@ -287,7 +287,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     if broken:
         report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
     if cut.crop and seen + outside:
-        report(scenes.crop_box(seen, seen + outside, cut.crop, low, high))
+        report(scenes.describe_crop(seen, seen + outside, cut.crop, low, high))
     if seen > capacity:
         report(f"{len(columns['x'])} of {seen} points kept while reading, drawn at random")
     return columns
@@ -371,7 +371,9 @@ def _believing(points: Points, report: Report) -> Points:
         values["base_color"] = values["base_color"].copy()
         values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
     centred = positions - positions.mean(axis=0)
-    thickness = float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0])) / max(spacing(tree), 1e-300)
+    thickness = float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0])) / max(
+        measure_spacing(tree), 1e-300
+    )
     if THIN[0] < thickness < THIN[1]:
         report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
     if "normals" in values and (reason := _doubt(positions, values["normals"])):
@@ -394,7 +396,7 @@ def _doubt(positions: np.ndarray, normals: np.ndarray) -> str:
     if len(known) < LEAST_POINTS:
         return ""
     rows = known[:: -(-len(known) // SAMPLE)]
-    surface = planes(positions[rows], positions)
+    surface = estimate_normals(positions[rows], positions)
     if np.abs(normals[rows] @ normals[rows[0]]).min() > 1 - 1e-6:
         fits = float(np.mean(np.abs(surface @ normals[rows[0]]) > PARALLEL))
         return "all are the same, and the points lie in no plane" if fits < PARALLEL else ""

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from spnr_jax.formats.row_files import camera_row, read_pcd_header
-from spnr_jax.surfels.normals import find_visible, spacing_of
+from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -119,4 +119,4 @@ def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: 
     """Whether that share of the points is seen from a place; `within` if one inside of their bounding box counts."""
     if np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0))):
         return within
-    return bool(find_visible(positions, place, spacing_of(positions), BEHIND).mean() > share)
+    return bool(find_visible(positions, place, measure_spacing(positions), BEHIND).mean() > share)

@@ -124,7 +124,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
                 return None
     if kind in READERS:
         return READERS[kind](path)
-    from spnr_jax.formats.meshes import points_of  # here: points are read without trimesh
+    from spnr_jax.formats.meshes import points_of  # here: points are read without the readers of meshes
 
     columns = points_of(path, kind)
     return None if columns is None else iter([columns])

@@ -118,7 +118,7 @@ def orbit(
     return look_at(centre + distance * direction, centre, up)
 
 
-def in_box(camera: Camera, centre: Float[AnyArray, "3"], scale: Float[AnyArray, ""]) -> Camera:
+def move_into_box(camera: Camera, centre: Float[AnyArray, "3"], scale: Float[AnyArray, ""]) -> Camera:
     """The camera (any axes of views) in the coordinates of the normalised box."""
     rotation, eye = camera.cam_to_world[..., :3], camera.cam_to_world[..., 3]
     eye = (eye - jnp.broadcast_to(centre, eye.shape)) * scale

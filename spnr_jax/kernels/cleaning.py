@@ -34,7 +34,7 @@ Clean = Literal["auto", "off", "strong"]
 Values = dict[str, np.ndarray]
 
 LEAST_POINTS = 100  # with fewer points, outliers cannot be told from the surface
-NEIGHBOURS = 8  # whose mean distance is a point's score
+NEIGHBORS = 8  # whose mean distance is a point's score
 SPARSE = 3.0  # times the median distance, above which the neighbours may be outliers themselves
 WIDE = 64  # neighbours that are considered in that case
 ROUND = 16, 0.05  # neighbours of a sparse point; share of their variance across the plane, above which
@@ -60,7 +60,7 @@ WIDER, MOST_WIDE = 2, 16  # factor on the number of neighbours; upper bound as a
 RADIUS = 1.0  # standard deviation of a neighbour's weight over that of the noise; wider ones erode thin parts
 LEAST_RADIUS = 1.0  # the same in spacings, at least
 AROUND = 64  # points in a local fit
-ALIKE, COLOUR_NOISE = 0.1, 2.0  # standard deviation of the weight by colour (square roots): least, over the noise
+ALIKE, COLOR_NOISE = 0.1, 2.0  # standard deviation of the weight by colour (square roots): least, over the noise
 MEAN, MEANT = 0.7, 32  # radius of the mean of the materials, over the noise or the spacing; points in it
 ROWS = 2**13  # points that are moved at a time: their neighbours fit into the cache
 CELL = 1.0, 3.0  # side of a voxel for the fringe: the larger of these standard deviations of the noise and spacings
@@ -103,55 +103,55 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
 def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
     """Points and other columns (points, ...) without outliers, and averaged; clean columns are not copied."""
     lines = []
-    apart = outliers(positions, strength)
-    if apart.any():
-        lines.append(f"removed {apart.sum():,} outliers of {len(positions):,} points")
-        positions, values = positions[~apart], {name: x[~apart] for name, x in values.items()}
-    sigma, spacing = noise(positions)
+    outlier = find_outliers(positions, strength)
+    if outlier.any():
+        lines.append(f"removed {outlier.sum():,} outliers of {len(positions):,} points")
+        positions, values = positions[~outlier], {name: x[~outlier] for name, x in values.items()}
+    sigma, spacing = measure_noise(positions)
     averages = bool(sigma > NOISY[strength] * spacing > 0)
     if averages:
         before = len(positions)
         positions, values = denoise(positions, values, sigma, spacing)
-        kept = ~fringe(positions, fringe_cell(sigma, spacing))
+        kept = ~find_fringe(positions, choose_fringe_cell(sigma, spacing))
         positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
     return Cleaned(positions, values, lines, sigma if averages else 0.0)
 
 
-def outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
+def find_outliers(positions: Float[np.ndarray, "points 3"], strength: Strength = "auto") -> Bool[np.ndarray, " points"]:
     """True for points that are much farther from their neighbours than their neighbours are from theirs."""
     distinct, copies = find_distinct(positions)
     left = np.arange(len(distinct))
     if len(left) >= LEAST_POINTS:
         tree = cKDTree(distinct)
-        distances, near = tree.query(distinct, NEIGHBOURS + 1, workers=-1)
+        distances, near = tree.query(distinct, NEIGHBORS + 1, workers=-1)
     for _ in range(ROUNDS):
         if len(left) < LEAST_POINTS:
             break
-        apart = _apart(tree, distances[:, 1:], near[:, 1:], strength)
-        if not apart.any():
+        outlier = _is_outlier(tree, distances[:, 1:], near[:, 1:], strength)
+        if not outlier.any():
             break
-        left, tree = left[~apart], cKDTree(distinct[left[~apart]])
-        distances, near = _without(apart, tree, distances, near)
+        left, tree = left[~outlier], cKDTree(distinct[left[~outlier]])
+        distances, near = _drop_points(outlier, tree, distances, near)
     removed = np.ones(len(distinct), bool)
     removed[left] = False
     return removed[copies]
 
 
-def _without(
-    apart: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
+def _drop_points(
+    outlier: np.ndarray, tree: cKDTree, distances: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows of the neighbours of all remaining points, themselves first; the tree holds these points."""
-    distances, near = distances[~apart], near[~apart]
-    lost = apart[near].any(axis=1)
-    near = (np.cumsum(~apart) - 1)[near]
+    distances, near = distances[~outlier], near[~outlier]
+    lost = outlier[near].any(axis=1)
+    near = (np.cumsum(~outlier) - 1)[near]
     if lost.any():
         distances[lost], near[lost] = tree.query(tree.data[lost], near.shape[1], workers=-1)
     return distances, near
 
 
-def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Strength) -> np.ndarray:
-    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBOURS)."""
+def _is_outlier(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Strength) -> np.ndarray:
+    """Mask (n,) of outliers among distinct points (n, 3), n >= LEAST_POINTS, from their neighbours (n, NEIGHBORS)."""
     positions = tree.data
     mean = distances.mean(axis=1)
     expected = np.median(mean[near], axis=1)
@@ -162,24 +162,24 @@ def _apart(tree: cKDTree, distances: np.ndarray, near: np.ndarray, strength: Str
     middle = np.median(score)
     deviation = 1.4826 * np.median(np.abs(score - middle))  # of a normal distribution with this MAD
     unlisted = np.bincount(near.ravel(), minlength=len(positions)) == 0
-    borne = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
-    apart = score > middle + borne
-    if apart.sum() <= FEW + CHANCE * len(positions):
-        apart = score > middle + SURE * borne
-    in_space = sparse[_across(positions[around[:, : ROUND[0]]]) > ROUND[1]]
+    limit = np.where(unlisted, UNLISTED, 1.0) * max(DEVIATIONS[strength] * deviation, np.log(LEAST_RATIO[strength]))
+    outlier = score > middle + limit
+    if outlier.sum() <= FEW + CHANCE * len(positions):
+        outlier = score > middle + SURE * limit
+    in_space = sparse[_measure_thickness(positions[around[:, : ROUND[0]]]) > ROUND[1]]
     if len(positions) >= LEAST_DENSE and len(in_space) <= MOST_ROUND * len(positions):
-        apart[in_space] = True
-    return apart
+        outlier[in_space] = True
+    return outlier
 
 
-def _across(near: np.ndarray) -> np.ndarray:
+def _measure_thickness(near: np.ndarray) -> np.ndarray:
     """Share (n,) of the variance of points (n, k, 3) along their narrowest axis: 0 for a plane, 1/3 for a ball."""
     offset = near - near.mean(axis=1, keepdims=True)
     squared = np.linalg.eigvalsh(np.swapaxes(offset, 1, 2) @ offset)
     return squared[:, 0] / np.maximum(squared.sum(axis=1), np.finfo(np.float64).tiny)
 
 
-def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
+def measure_noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) for too few points.
 
     Below LEAST_DENSE points, noise cannot be told from curvature.  In the units of the positions.
@@ -193,13 +193,13 @@ def noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     while True:
         distances, near = tree.query(sample, [1 + count * i // HEIGHTS for i in range(1, HEIGHTS + 1)], workers=-1)
         radius = float(np.median(distances[:, -1]))
-        thickness = float(np.quantile(_heights(distinct[near]), FLATTEST)) / radius
+        thickness = float(np.quantile(_measure_heights(distinct[near]), FLATTEST)) / radius
         if thickness < THICKEST or MOST_WIDE * count > len(distinct):
             return radius * float(np.interp(thickness, THICKNESS, NOISES)), radius * np.sqrt(np.pi / (count + 1))
         count *= WIDER
 
 
-def _heights(near: np.ndarray) -> np.ndarray:
+def _measure_heights(near: np.ndarray) -> np.ndarray:
     """Height (n,) within which SHARE of the neighbours (n, HEIGHTS, 3) lie of the best plane through three."""
     rng = np.random.default_rng(0)
     best = np.full(len(near), np.inf)
@@ -228,24 +228,24 @@ def denoise(
     start, known = positions[rows].astype(np.float64), positions[basis].astype(np.float64)
     color = np.sqrt(np.maximum(values.get("base_color", np.zeros((len(positions), 1))), 0))
     tree, own, others = cKDTree(known), color[rows], color[basis]
-    alike = _alike(tree, others)
+    color_sigma = _choose_color_sigma(tree, others)
 
     def moved_of(piece: slice) -> np.ndarray:
-        return _denoise_step(start[piece], own[piece], tree, others, sigma, radius, alike)
+        return _denoise_step(start[piece], own[piece], tree, others, sigma, radius, color_sigma)
 
     moved = np.concatenate([moved_of(slice(i, i + ROWS)) for i in range(0, len(start), ROWS)])
-    means = _means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
+    means = _local_means(moved, {name: column[rows] for name, column in values.items()}, MEAN * max(sigma, spacing))
     if "normals" in means:
         means["normals"] = unit_means(means["normals"])
     return moved, means
 
 
-def _alike(tree: cKDTree, color: np.ndarray) -> float:
+def _choose_color_sigma(tree: cKDTree, color: np.ndarray) -> float:
     """Standard deviation of a neighbour's weight by colour: wider than the noise of the colours (n, channels)."""
     sample = slice(None, None, -(-tree.n // SAMPLE))
     near = tree.query(tree.data[sample], list(range(1, min(AROUND, tree.n) + 1)), workers=-1)[1]
-    apart = np.linalg.norm(color[near] - color[sample, None], axis=-1)
-    return max(ALIKE, COLOUR_NOISE * float(np.median(np.quantile(apart, 0.25, axis=1))))
+    outlier = np.linalg.norm(color[near] - color[sample, None], axis=-1)
+    return max(ALIKE, COLOR_NOISE * float(np.median(np.quantile(outlier, 0.25, axis=1))))
 
 
 def _denoise_step(
@@ -255,15 +255,15 @@ def _denoise_step(
     color: np.ndarray,
     sigma: float,
     radius: float,
-    alike: float,
+    color_sigma: float,
 ) -> np.ndarray:
     """Points (n, 3) after one step, from the points of similar colour around them."""
 
     def spread(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        near, weights = _around(points, tree, radius, AROUND)
-        weights *= np.exp(-0.5 * np.sum(((color[near] - own[:, None]) / alike) ** 2, axis=-1))
+        near, weights = _query_neighbors(points, tree, radius, AROUND)
+        weights *= np.exp(-0.5 * np.sum(((color[near] - own[:, None]) / color_sigma) ** 2, axis=-1))
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
-        return _spread(points, tree.data[near], weights)
+        return _find_local_axes(points, tree.data[near], weights)
 
     towards, squared, axes = spread(start)
     squared = np.maximum(squared, 1 / (1 / sigma**2 + 1 / radius**2))  # least variance of a window of pure noise
@@ -272,24 +272,26 @@ def _denoise_step(
     return moved + towards[:, :1] * axes[..., 0]
 
 
-def _means(positions: np.ndarray, columns: Values, radius: float) -> Values:
+def _local_means(positions: np.ndarray, columns: Values, radius: float) -> Values:
     """Local means of the columns, over the points around each position."""
     tree = cKDTree(positions)
-    pieces = [_around(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
+    pieces = [_query_neighbors(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]
     return {
         name: np.concatenate([np.einsum("nk,nk...->n...", weights, column[near]) for near, weights in pieces])
         for name, column in columns.items()
     }
 
 
-def _around(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _query_neighbors(points: np.ndarray, tree: cKDTree, radius: float, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows (n, k) of at most `most` neighbours of points (n, 3), and their weights, which sum to 1."""
     distances, near = tree.query(points, list(range(1, min(most, tree.n) + 1)), workers=-1)
     weights = np.exp(-0.5 * (distances / radius) ** 2)
     return near, weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
 
 
-def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _find_local_axes(
+    points: np.ndarray, near: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Offset to the mean of the neighbours (n, k, 3) along the axes of their covariance, the eigenvalues, the axes."""
     offset = near - points[:, None]
     mean = (weights[:, None] @ offset)[:, 0]
@@ -298,12 +300,12 @@ def _spread(points: np.ndarray, near: np.ndarray, weights: np.ndarray) -> tuple[
     return np.einsum("nij,ni->nj", axes, mean), squared, axes
 
 
-def fringe_cell(sigma: float, spacing: float) -> float:
-    """Side of the voxels for `fringe`, from the noise and the spacing."""
+def choose_fringe_cell(sigma: float, spacing: float) -> float:
+    """Side of the voxels for `find_fringe`, from the noise and the spacing."""
     return max(CELL[0] * sigma, CELL[1] * spacing)
 
 
-def fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:
+def find_fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:
     """True for points in voxels of this side that hold far fewer points than the voxels around them."""
     _, first, rows, count = np.unique(
         voxel_keys(positions - positions.min(axis=0), side), return_index=True, return_inverse=True, return_counts=True

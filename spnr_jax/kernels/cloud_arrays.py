@@ -91,13 +91,13 @@ def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> t
 
     Of merged points, the first keeps its position.  A cloud without repeats is returned unchanged.
     """
-    labels = _labels(positions)
+    labels = _label_repeats(positions)
     _, first, group = np.unique(labels, return_index=True, return_inverse=True)
     merged = len(positions) - len(first)
     if not merged:
         return positions, values, 0
     kept = np.sort(first)
-    values = {name: _means(column, group)[group[kept]] for name, column in values.items()}
+    values = {name: _group_means(column, group)[group[kept]] for name, column in values.items()}
     if "normals" in values:
         values["normals"] = unit_means(values["normals"])
     return positions[kept], values, merged
@@ -109,13 +109,13 @@ def unit_means(normals: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "poi
     return np.where(length > CANCELLED, normals / np.maximum(length, CANCELLED), 0)
 
 
-def _labels(positions: np.ndarray) -> np.ndarray:
+def _label_repeats(positions: np.ndarray) -> np.ndarray:
     """A label (points,) for each position; equal and nearly equal points share one."""
     distinct, rows = find_distinct(positions)
     if len(distinct) < FEW:
         return rows
     tree = cKDTree(distinct)
-    pairs = tree.query_pairs(NEAR * spacing(tree), output_type="ndarray")
+    pairs = tree.query_pairs(NEAR * measure_spacing(tree), output_type="ndarray")
     if not len(pairs):
         return rows
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(distinct),) * 2)
@@ -135,14 +135,17 @@ def find_distinct(
     return ranked[new], rows
 
 
-def spacing(tree: cKDTree) -> float:
-    """Median side of the square that a point represents, from the distances of many neighbours."""
-    count = max(2, min(AROUND, tree.n // 4))
-    radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count])[0]
+def measure_spacing(tree: cKDTree, neighbors: int | None = None, sample: int = SAMPLE) -> float:
+    """Median side of the square that a point represents, from the distance to its nth nearest point, itself included.
+
+    By default n is AROUND, at most a quarter of the points, so that repeated copies of a scan do not bias it.
+    """
+    count = neighbors or max(2, min(AROUND, tree.n // 4))
+    radius = tree.query(tree.data[:: -(-tree.n // sample)], [count], workers=-1)[0]
     return float(np.median(radius)) * float(np.sqrt(np.pi / count))
 
 
-def _means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _group_means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Means (groups, ...) of the rows of each group."""
     order = np.argsort(group, kind="stable")
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
@@ -188,10 +191,10 @@ def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
     its number.  At any time, only the kept rows and one piece are in memory.
     """
     kept: Columns = {}
-    keys, seen, halvings = np.zeros(0, np.uint64), 0, 0
+    keys, num_rows, halvings = np.zeros(0, np.uint64), 0, 0
     for piece in pieces:
-        rows = np.arange(seen + 1, seen + 1 + len(piece["x"]), dtype=np.uint64) * SCATTER
-        seen += len(rows)
+        rows = np.arange(num_rows + 1, num_rows + 1 + len(piece["x"]), dtype=np.uint64) * SCATTER
+        num_rows += len(rows)
         if halvings:
             piece, rows = _rows_below(piece, rows, halvings)
         kept = {name: np.concatenate([kept[name], piece[name]]) for name in piece} if kept else dict(piece)
@@ -199,7 +202,7 @@ def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
         while len(keys) > most:
             halvings += 1
             kept, keys = _rows_below(kept, keys, halvings)
-    return kept, seen
+    return kept, num_rows
 
 
 def _rows_below(columns: Columns, keys: np.ndarray, halvings: int) -> tuple[Columns, np.ndarray]:
@@ -228,7 +231,7 @@ def voxel_keys(positions: np.ndarray, voxel: float) -> np.ndarray:
     return (x << 2 * KEY_BITS) | (y << KEY_BITS) | z
 
 
-def frame(positions: np.ndarray) -> tuple[np.ndarray, float]:
+def find_extent(positions: np.ndarray) -> tuple[np.ndarray, float]:
     """Corner (3,) and side of a cube that holds most of the positions (n, 3)."""
     low, high = np.quantile(positions, INNER, axis=0)
     return low, max(float((high - low).max()), SMALLEST_EXTENT)
@@ -241,7 +244,7 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
     """
     if len(positions) <= THINNING * count:
         return np.arange(len(positions))
-    corner, extent = frame(positions)
+    corner, extent = find_extent(positions)
     chosen = np.arange(1)
     for halving in range(HALVINGS):
         finer = first_in_voxels(positions - corner, extent / 2**halving)
@@ -274,7 +277,7 @@ def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
         squared[last] = -1
         chosen[step] = np.argmax(squared)
     if count > FIRST:
-        _go_on(chosen, columns, squared)
+        _continue_farthest(chosen, columns, squared)
     return among[chosen]
 
 
@@ -284,7 +287,7 @@ def _squares(columns: np.ndarray, place: np.ndarray) -> np.ndarray:
     return (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
 
 
-def _go_on(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
+def _continue_farthest(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
     """Chooses points from FIRST on: a new point changes only the distances of points that it is nearest to.
 
     Distances only shrink, so as long as one of the candidates is still far, the farthest point is among them.

@@ -39,7 +39,7 @@ def srgb_to_linear(encoded: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 # --- sizes ------------------------------------------------------------------------------------------------------------
 
 
-def bilinear(
+def resize_bilinear(
     x: Float[Array, "batch height width features"], height: int, width: int
 ) -> Float[Array, "batch h w features"]:
     """Image resized with half-pixel centres (not aligned at the corners)."""
@@ -50,24 +50,24 @@ def double_size(x: Float[Array, "batch height width features"]) -> Float[Array, 
     """Twice the size, bilinear; the border repeats."""
     for axis in (1, 2):
         size = x.shape[axis]
-        before = jnp.concatenate([_part(x, axis, 0, 1), _part(x, axis, 0, size - 1)], axis)
-        after = jnp.concatenate([_part(x, axis, 1, size), _part(x, axis, size - 1, size)], axis)
+        before = jnp.concatenate([_slice(x, axis, 0, 1), _slice(x, axis, 0, size - 1)], axis)
+        after = jnp.concatenate([_slice(x, axis, 1, size), _slice(x, axis, size - 1, size)], axis)
         pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
         x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
     return x
 
 
-def _part(x: Array, axis: int, first: int, end: int) -> Array:
+def _slice(x: Array, axis: int, first: int, end: int) -> Array:
     return jax.lax.slice_in_dim(x, first, end, axis=axis)
 
 
-def mean_of_squares(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
+def average_pool(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:
     """The mean over each square of side x side pixels."""
     *batch, height, width, features = x.shape
     return jnp.mean(x.reshape(*batch, height // side, side, width // side, side, features), axis=(-4, -2))
 
 
-def unfold(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
+def depth_to_space(x: Float[Array, "*batch h w folded"], side: int) -> Float[Array, "*batch height width features"]:
     """Rearranges the features of each pixel to a square of side x side pixels (depth to space)."""
     *batch, height, width, features = x.shape
     x = jnp.swapaxes(x.reshape(*batch, height, width, side, side, features // side**2), -4, -3)

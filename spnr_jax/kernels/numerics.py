@@ -89,18 +89,18 @@ def smaller(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) 
     return jnp.where(a < b, a, b)
 
 
-def root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root; 0 with zero gradient where x is 0 or, by rounding, negative."""
     valid = x > 0
     return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
 
 
-def namespace(*values: Any) -> ModuleType:
+def array_namespace(*values: Any) -> ModuleType:
     """jax.numpy if any value is a JAX array, traced or not; otherwise NumPy, which compiles nothing."""
     return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
-def columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
+def split_columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:
     """The features as separate arrays; their gradients are stacked once (gradients of slices are padded and summed).
 
     For twenty columns, XLA's CPU compiler takes five times as long for the sum of the padded ones.
@@ -112,7 +112,7 @@ def rotate_columns(
     matrix: Float[Array | np.ndarray, "3 3"], vectors: Float[Array | np.ndarray, "points 3"]
 ) -> tuple[Array, Array, Array]:
     """Columns of vectors @ matrix."""
-    x, y, z = columns(jnp.asarray(vectors))
+    x, y, z = split_columns(jnp.asarray(vectors))
     one, two, three = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
     return one, two, three
 
@@ -179,7 +179,7 @@ POINT = 1e-9  # least trace of a covariance with extent: gradients divide by its
 SMALLEST = 1e-7  # times the trace: variances below are rounding
 
 
-def total(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
+def sum_first(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """Sum over the first axis.  The barrier keeps XLA's CPU compiler from computing the terms one number at a time."""
     return jnp.sum(jax.lax.optimization_barrier(values), axis=0)
 
@@ -215,11 +215,11 @@ def multiply(
 
 def _eliminate(matrix: Array, right: Array) -> Array:
     """Gauss-Jordan elimination; positive definite systems need no pivoting."""
-    places = jnp.arange(len(matrix))[:, None, None]
+    indices = jnp.arange(len(matrix))[:, None, None]
 
     def eliminate(pivot: Array, rows: Array) -> Array:
         row = rows[pivot] / rows[pivot, pivot][None]
-        return jnp.where(places == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
+        return jnp.where(indices == pivot, row[None], rows - rows[:, pivot][:, None] * row[None])
 
     rows = jnp.concatenate([matrix, right], axis=1)
     return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
@@ -265,7 +265,7 @@ def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions
     return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
 
 
-def frame(normal: Float[Array, "3 points"]) -> Float[Array, "3 3 points"]:
+def tangent_frame(normal: Float[Array, "3 points"]) -> Float[Array, "3 3 points"]:
     """Two tangents and the unit normal (Duff et al. 2017)."""
     x, y, z = normal
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(normal.dtype)
@@ -315,4 +315,4 @@ def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"
     least, most = (jnp.sum(x * scaled, axis=(0, 1)) for x in (narrowest, widest))
     middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
     ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), SMALLEST)
-    return root(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))
+    return safe_sqrt(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))

@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from spnr_jax.kernels.numerics import namespace
+from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
 LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
@@ -29,11 +29,11 @@ class PointCloud:
     metallic: Float[AnyArray, "*batch points"]
     mask: Bool[AnyArray, "*batch points"]
     normals: Float[AnyArray, "*batch points 3"] | None = None
-    """Of unit length, of either sign; None where none are known: then they are estimated from these points."""
+    """Of unit length, of either sign; None: they are estimated from these points."""
     materials_known: Float[AnyArray, "*batch points"] | None = None
-    """1 where roughness and metallic are known, 0 where they stand for any; None where all are known."""
-    invented: Float[AnyArray, "*batch points"] | None = None
-    """0 where a point was measured, else 1 - p / 2 of the probability p that it lies on the surface; None: all were."""
+    """1 where roughness and metallic are known, else 0; None: known everywhere."""
+    learned: Float[AnyArray, "*batch points"] | None = None
+    """0 for a measured point; 1 - p / 2 for a learned one, where p is the probability that it lies on the surface."""
 
 
 @no_type_check
@@ -72,7 +72,7 @@ class Rendering:
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
     overflow: Int[Array, "*batch"] | None = None
-    """Of surfels: entries, pixels, columns and rows that did not fit into the sizes of the plan; 0: all is drawn."""
+    """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 
 
 @no_type_check
@@ -96,7 +96,7 @@ class Volume:
     centre: Float[AnyArray, "3"]
     scale: Float[AnyArray, ""]
     reach: int = struct.field(pytree_node=False, default=LARGEST_REACH)
-    """Voxels around points that rays look at, from how far the points lie apart."""
+    """Voxels around points within which rays are sampled; follows from the point spacing."""
 
 
 @no_type_check
@@ -104,30 +104,30 @@ class Volume:
 class Surfels:
     """Surface elements of one object (`surfels/geometry.py`): discs with materials; zeros where `mask` is False.
 
-    `spacing` is the side of the square that a point represents, in units of the box.  `border` is a line in the disc's
-    plane: a unit vector across it and its distance from the point (0: none); `jump` is added to the colour beyond it.
-    `sided` is near 1 where one side is outside, 0 where both are.  `visible` is the visibility from each of 64
-    directions. `shape` is the planarity and linearity of the neighbourhood.  A disc ends `reach` spacings from its
-    point along `rim` (a unit vector in its plane), against it, along normal x rim and against that.  `guessed` is 1
-    where roughness and metallic are unknown, `invented` 0 for a measured point and above 0 for a learned one
-    (`method/densifier.py`).
+    `spacing` is the side of the square that a point represents, in units of the box.  `color_edge` is a line in the
+    disc's plane: a unit vector across it and its distance from the point; `color_jump` is added to the colour beyond it
+    (0: no edge).  `one_sided` is near 1 where one side is outside, 0 for a two-sided disc.  `visibility` is given from
+    each of 64 directions.  `shape_ratios` are the planarity and linearity of the neighbourhood.  `rim_distances` are
+    the distances, in spacings, at which the disc ends: along `rim_tangent` (a unit vector in its plane), against it,
+    along normal x rim_tangent and against that.  `materials_unknown` is 1 where roughness and metallic are unknown.
+    `learned` is 0 for a measured point and above 0 for a learned one (`method/densifier.py`).
     """
 
     position: Float[AnyArray, "*batch points 3"]
     normal: Float[AnyArray, "*batch points 3"]
     spacing: Float[AnyArray, "*batch points"]
     base_color: Float[AnyArray, "*batch points 3"]
-    border: Float[AnyArray, "*batch points 4"]
-    jump: Float[AnyArray, "*batch points 3"]
+    color_edge: Float[AnyArray, "*batch points 4"]
+    color_jump: Float[AnyArray, "*batch points 3"]
     roughness: Float[AnyArray, "*batch points"]
     metallic: Float[AnyArray, "*batch points"]
-    guessed: Float[AnyArray, "*batch points"]
-    invented: Float[AnyArray, "*batch points"]
-    sided: Float[AnyArray, "*batch points"]
-    visible: Float[AnyArray, "*batch points 64"]
-    shape: Float[AnyArray, "*batch points 2"]
-    rim: Float[AnyArray, "*batch points 3"]
-    reach: Float[AnyArray, "*batch points 4"]
+    materials_unknown: Float[AnyArray, "*batch points"]
+    learned: Float[AnyArray, "*batch points"]
+    one_sided: Float[AnyArray, "*batch points"]
+    visibility: Float[AnyArray, "*batch points 64"]
+    shape_ratios: Float[AnyArray, "*batch points 2"]
+    rim_tangent: Float[AnyArray, "*batch points 3"]
+    rim_distances: Float[AnyArray, "*batch points 4"]
     mask: Bool[AnyArray, "*batch points"]
 
 
@@ -172,7 +172,7 @@ class Light:
 
         Exact for multiples of a texel, 5.625 degrees; otherwise texels are interpolated.  The angle may be traced.
         """
-        xp = namespace(degrees)
+        xp = array_namespace(degrees)
         columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
         part = columns - whole
@@ -188,21 +188,21 @@ class GBuffer:
     """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes.
 
     `opacity` is that of all surfels along the ray, `coverage` the summed weights of the front-most.  `depth` is along
-    the camera's axis, `spread` its standard deviation.  `color` is blended with the narrower weights, the rest with the
-    wider ones.  `centres` sums the narrower weights; `beside` is the mean offset of the discs' centres from the
-    pixel's, in pixels.  All fields are 0 at pixels without discs.
+    the camera's axis, `depth_deviation` its standard deviation.  `color` is blended with narrower weights than the
+    rest; `sharp_weight` is their sum, and `centre_offset` the mean offset of the discs' centres from the pixel's, in
+    pixels.  All fields are 0 at pixels without discs.
     """
 
     opacity: Float[Array, "height width"]
     coverage: Float[Array, "height width"]
     depth: Float[Array, "height width"]
-    spread: Float[Array, "height width"]
+    depth_deviation: Float[Array, "height width"]
     log_spacing: Float[Array, "height width"]
     normal: Float[Array, "height width 3"]
     color: Float[Array, "height width 3"]
     attributes: Float[Array, "height width features"]
-    centres: Float[Array, "height width"]
-    beside: Float[Array, "height width 2"]
+    sharp_weight: Float[Array, "height width"]
+    centre_offset: Float[Array, "height width 2"]
 
 
 @no_type_check
@@ -223,11 +223,11 @@ class Batch:
 class Crops:
     """One training batch of the shader network: crops of G-buffers as network inputs (`nn/shader.py`).
 
-    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `seen` extends
+    `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `inputs` extend
     `margin` pixels beyond it and beyond the light maps on each side.
     """
 
-    seen: Float[AnyArray, "crops rows columns 33"]
+    inputs: Float[AnyArray, "crops rows columns 33"]
     maps: Float[AnyArray, "crops height width 17"]
     ambient: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]

@@ -17,14 +17,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.cloud_arrays import first_in_voxels, frame
+from spnr_jax.kernels.cloud_arrays import find_extent, first_in_voxels
 
 Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
 
 CROWD = 4.0  # points per voxel, on average
 COARSEST, FINER, TRIES = 4.0, 2**0.5, 40  # fewest voxels along the extent; ratio and number of the sides tried
-NEIGHBOURS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
+NEIGHBORS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
 SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, candidate planes, refits
 CLOSE = 0.5  # voxels: largest distance of an inlier from the plane
 THICK = 3.0  # standard deviations of the inliers, at most a voxel: removing the plane removes its noise
@@ -45,17 +45,17 @@ class Plane:
         return np.abs(positions @ self.normal - self.offset) <= self.thickness
 
 
-def in_box(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarray, " points"]:
+def is_inside(positions: Float[np.ndarray, "points 3"], box: Box) -> Bool[np.ndarray, " points"]:
     """True for points in the box with corners xmin ymin zmin and xmax ymax zmax, borders included."""
     return np.all((positions >= np.asarray(box[:3])) & (positions <= np.asarray(box[3:])), axis=-1)
 
 
-def crop_box(kept: int, seen: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
+def describe_crop(kept: int, total: int, box: Box, low: np.ndarray, high: np.ndarray) -> str:
     """The message about a cropped box whose points lie from low (3,) to high (3,); ValueError if it is empty."""
     if not kept:
-        asked = " ".join(f"{value:g}" for value in box)
-        raise UserError(f"--crop {asked}: none of the {seen:,} points, they lie in the box {_format_box(low, high)}")
-    return f"--crop: {kept:,} of {seen:,} points lie inside"
+        corners = " ".join(f"{value:g}" for value in box)
+        raise UserError(f"--crop {corners}: none of the {total:,} points, they lie in the box {_format_box(low, high)}")
+    return f"--crop: {kept:,} of {total:,} points lie inside"
 
 
 def _format_box(low: np.ndarray, high: np.ndarray) -> str:
@@ -65,7 +65,7 @@ def _format_box(low: np.ndarray, high: np.ndarray) -> str:
     return " ".join(f"{value + 0.0:.{decimals}f}" for value in (*low, *high))
 
 
-def object_of(
+def select_object(
     positions: Float[np.ndarray, "points 3"],
     origin: Float[np.ndarray, "3"],
     remove_plane: bool,
@@ -78,7 +78,7 @@ def object_of(
     """
     rows, lines = np.arange(len(positions)), []
     if remove_plane:
-        plane = dominant_plane(positions, seed)
+        plane = find_dominant_plane(positions, seed)
         if plane is None:
             raise UserError(f"--remove-plane: no plane holds {LEAST_PLANE:.0%} of the surface; leave it out")
         rows = np.flatnonzero(~plane.holds(positions))
@@ -89,7 +89,7 @@ def object_of(
             f"{plane.thickness:.3g} of the plane through most of the surface"
         )
     if nth is not None:
-        labels = clusters(positions[rows])
+        labels = find_clusters(positions[rows])
         count = int(labels.max()) + 1
         if nth > count:
             there = f"are {count} clusters" if count > 1 else "is 1 cluster"
@@ -101,9 +101,9 @@ def object_of(
     return rows, lines
 
 
-def voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
+def choose_voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
     """Side of the finest voxels that hold CROWD points on average."""
-    corner, extent = frame(positions)
+    corner, extent = find_extent(positions)
     coarse, fine = 0, TRIES  # steps; the first is accepted whatever it holds
     while fine - coarse > 1:
         step = (coarse + fine) // 2
@@ -112,16 +112,16 @@ def voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
     return extent / COARSEST / FINER**coarse
 
 
-def clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
-    """The cluster index of each point, 0 for the largest; `voxel` is voxel_side by default.
+def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
+    """The cluster index of each point, 0 for the largest; `voxel` is `choose_voxel_side` by default.
 
     Ties in size are broken by the order of the clusters' first points.
     """
-    x, y, z = (_slices(axis, voxel or voxel_side(positions)) for axis in positions.T)
+    x, y, z = (_slices(axis, voxel or choose_voxel_side(positions)) for axis in positions.T)
     deep, wide = int(z.max()) + 2, int(y.max()) + 2
     keys, first, rows = np.unique((x * wide + y) * deep + z, return_index=True, return_inverse=True)
     ends = []
-    for dx, dy, dz in NEIGHBOURS:
+    for dx, dy, dz in NEIGHBORS:
         wanted = keys + (dx * wide + dy) * deep + dz
         place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         touching = np.flatnonzero(keys[place] == wanted)
@@ -143,10 +143,10 @@ def _slices(axis: np.ndarray, voxel: float) -> np.ndarray:
     return 1 + np.concatenate([[0], np.cumsum(np.minimum(np.diff(found), 2))]).astype(np.int64)[rows]
 
 
-def dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> Plane | None:
+def find_dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> Plane | None:
     """The plane with most of the surface near it; None if that is less than LEAST_PLANE of the area."""
-    voxel = voxel_side(positions)
-    corner, _ = frame(positions)
+    voxel = choose_voxel_side(positions)
+    corner, _ = find_extent(positions)
     rng = np.random.default_rng(seed)
     evenly = positions[first_in_voxels(positions - corner, voxel)]
     sample = evenly[rng.permutation(len(evenly))[:SAMPLE]]

@@ -1,9 +1,10 @@
 """Points to volume and back (scatter to voxels, trilinear lookup), and empty-space skipping.
 
-A scatter is a sum: each point adds its features, over the number of points in its voxel, to the voxel (`spread`).
-`gather_rows` and `scatter_rows` are each other's transpose.  Under vmap both flatten the mapped axes into one table:
-XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3 voxels, 2 objects).  On a
-device mesh there is a table per group of objects; in a common one XLA could not know that rows stay on their device.
+A scatter is a sum: each point adds its features, over the number of points in its voxel, to the voxel
+(`mean_contributions`).  `gather_rows` and `scatter_rows` are each other's transpose.  Under vmap both flatten the
+mapped axes into one table: XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3
+voxels, 2 objects).  On a device mesh there is a table per group of objects; in a common one XLA could not know that
+rows stay on their device.
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
@@ -30,7 +31,7 @@ from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rays
 
-NEIGHBOURS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
+NEIGHBORS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
@@ -73,10 +74,10 @@ def _gather_vmap(axis_size, in_batched, table, index):
 
 @_scatter.def_vmap
 def _scatter_vmap(axis_size, in_batched, *arguments):
-    def spread(x, batched):
+    def broadcast(x, batched):
         return x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
 
-    arguments = tuple(map(spread, arguments, in_batched))
+    arguments = tuple(map(broadcast, arguments, in_batched))
     return _by_group(_scatter, _plain_scatter, *arguments).reshape(arguments[0].shape), True
 
 
@@ -195,7 +196,7 @@ def mark_occupied(
     return jnp.zeros(resolution**3 + 1, bool).at[rows].set(True)[:-1].reshape(*[resolution] * 3)
 
 
-def spread(
+def mean_contributions(
     positions: Float[Array, "points 3"],
     features: Float[Array, "points features"],
     mask: Bool[Array, " points"],
@@ -221,7 +222,7 @@ def scatter_mean(
     """
     if positions.ndim > 2:
         return jax.vmap(lambda p, f, m: scatter_mean(p, f, m, resolution))(positions, features, mask)
-    rows, values = spread(positions, features, mask, resolution)
+    rows, values = mean_contributions(positions, features, mask, resolution)
     summed = scatter_rows(rows, values, resolution**3 + 1)[:-1].reshape(*[resolution] * 3, -1)
     return summed[..., :-1], summed[..., -1]
 
@@ -239,7 +240,7 @@ def scatter_conv(
     """
     products = jnp.einsum("pf,tfo->pto", values, kernel.reshape(27, *kernel.shape[3:]), precision="highest")
     # the output at voxel v reads voxel v + n through tap n: a point contributes to its neighbours at -n
-    steps = -jnp.array([NEIGHBOURS], jnp.int32)
+    steps = -jnp.array([NEIGHBORS], jnp.int32)
     cell = jnp.stack([rows // resolution**2, rows // resolution % resolution, rows % resolution], axis=-1)
     cell = cell[:, None] + steps
     valid = (rows < resolution**3)[:, None] & jnp.all((cell >= 0) & (cell < resolution), axis=-1)
@@ -261,14 +262,14 @@ def trilinear(
     if volume.ndim > 4 and objects is None:
         return jax.vmap(trilinear)(volume, positions)
     resolution = volume.shape[-2]
-    lowest, weights, steps = corners(positions, resolution)
+    lowest, weights, steps = find_corners(positions, resolution)
     if objects is not None:
         lowest = lowest + objects.reshape(-1) * resolution**3
     out = blend_rows(volume.reshape(-1, volume.shape[-1]), lowest, weights, steps)
     return out.reshape(*positions.shape[:-1], volume.shape[-1])
 
 
-def corners(
+def find_corners(
     positions: Float[Array, "*batch 3"], resolution: int
 ) -> tuple[Int[Array, " n"], Float[Array, "n 8"], tuple[int, ...]]:
     """First row of the eight nearest voxel centres in the flattened volume, their weights, and the steps between them.
@@ -294,7 +295,7 @@ def corners(
 
 @no_type_check  # pytree transformations rebuild records with leaves that are no arrays
 @struct.dataclass
-class Path:
+class RayPath:
     """Cells along rays: their sorted `edges`, distances along the ray, and the open length up to each edge."""
 
     edges: Float[Array, "*batch cells+1"]
@@ -317,7 +318,7 @@ def open_path(
     far: Float[Array, "*batch"],
     num_cells: int,
     objects: Int[Array, "*batch"] | None = None,
-) -> Path:
+) -> RayPath:
     """Cells between near and far; the first axes of the rays are the objects of `near_points`.  No gradient.
 
     With `objects`, the object of each ray, the rays may have any axes.  A cell is open if the voxel at its middle is
@@ -338,15 +339,17 @@ def open_path(
     is_open = gather_rows(near_points.reshape(-1, 1).astype(near.dtype), first + row_at(x, y, z, resolution))[..., 0]
     # count equal cells by a matrix product: a running sum is slower on a CPU, docs/lab/cpu_forms.md
     count = is_open @ jnp.triu(jnp.ones((num_cells, num_cells + 1), near.dtype), 1)
-    return jax.lax.stop_gradient(Path(edges=edges, travelled=count * ((far - near) / num_cells)))
+    return jax.lax.stop_gradient(RayPath(edges=edges, travelled=count * ((far - near) / num_cells)))
 
 
-def whole_path(near: Float[Array, "*batch"], far: Float[Array, "*batch"]) -> Path:
+def whole_path(near: Float[Array, "*batch"], far: Float[Array, "*batch"]) -> RayPath:
     """The whole ray between near and far as one open cell."""
-    return Path(edges=jnp.stack([near, far], axis=-1), travelled=jnp.stack([jnp.zeros_like(near), far - near], axis=-1))
+    return RayPath(
+        edges=jnp.stack([near, far], axis=-1), travelled=jnp.stack([jnp.zeros_like(near), far - near], axis=-1)
+    )
 
 
-def distance_at(path: Path, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:
+def distance_at(path: RayPath, travelled: Float[Array, "*batch samples"]) -> Float[Array, "*batch samples"]:
     """Distance along the ray at which the open length is `travelled`; at a gap, the end of the cell in front of it.
 
     Values beyond the open length of the ray end at the last edge.

@@ -4,11 +4,11 @@
     place      middle of a pair's curved edge (PN triangles, Vlachos et al. 2001), and a local frame there
     predict    graph convolutions over the points, then a PointNet over the points around each candidate, in its frame:
                offset to the surface, normal, probability that the point exists, and material weights
-    choose     keep the likely children that are not too close to better ones
+    select     keep the likely points that are not too close to better ones
 
 The network is rotation-equivariant: lengths are in spacings, vectors in frames that rotate with the cloud.  The
-neighbors come from the host.  The choice of pairs, of the points around them and of children has no gradient;
-positions, normals and materials are differentiable.  A *child* is a learned point; an *end* is a point of a pair.
+neighbors come from the host.  The choice of pairs, of the points around them and of the kept points has no gradient;
+positions, normals and materials are differentiable.  An *end* is a point of a pair.
 """
 
 import dataclasses
@@ -21,30 +21,30 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.numerics import clamp, length, normalize, root
+from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.surfels.geometry import estimate_surfels, move_into_box
+from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 
-MOST_POINTS = 32768  # a cloud of more points gets no children
-SPARSE = 8192  # points: up to here children are added everywhere; in larger clouds, only at rims and on curved parts
+MOST_POINTS = 32768  # a cloud of more points gets no learned points
+SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims and on curves
 BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
-CHILDREN = 6  # candidates of each point: middles of the pairs that it owns, then open places
-AROUND = 16  # nearest points from which a child is predicted
+CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places
+NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
 ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
 LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
-WAYS = 6  # directions in each tangent plane that are tested for openness; the first points to the nearest neighbor
+TANGENT_DIRECTIONS = 6  # tested for openness in each tangent plane; the first points to the nearest neighbor
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
-OPEN = 0.5  # spacings from a point to its open place
-CLOSEST = 0.2  # spacings: a child closer than this to a measured point or to a better child is dropped
-AWAY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to CLOSEST
-FARTHEST = 4.0  # cap of that squared ratio to measured points: being farther away is no better
+OPEN_DISTANCE = 0.5  # spacings from a point to its open place
+LEAST_DISTANCE = 0.2  # spacings: a learned point closer than this to a measured or a better learned one is dropped
+NORMAL_PENALTY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to LEAST_DISTANCE
+LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther away is no better
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
 EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
-LIKELY = 0.55  # probability above which a child is kept
+LEAST_PROBABILITY = 0.55  # probability above which a learned point is kept
 
 
 class Nodes(NamedTuple):
@@ -57,7 +57,7 @@ class Nodes(NamedTuple):
     traits: Float[Array, "n 5"]
 
 
-class Places(NamedTuple):
+class Candidates(NamedTuple):
     """Candidate positions: the two ends of each (the same point twice at an open place) and the points around it.
 
     `exists` is False for unused slots.  Rows of `frame` are unit vectors: from the first to the second end, across, and
@@ -73,30 +73,30 @@ class Places(NamedTuple):
     around: Int[Array, "m 16"]
 
 
-class Children(NamedTuple):
-    """A child of each candidate: `offset` from its middle in its frame, log odds that it exists, material weights."""
+class LearnedPoints(NamedTuple):
+    """The point predicted for each candidate: `offset` from the middle in its frame, logit of existence, weights."""
 
     position: Float[Array, "m 3"]
     offset: Float[Array, "m 3"]
     normal: Float[Array, "m 3"]
-    odds: Float[Array, " m"]
-    shares: Float[Array, "m 16"]
+    logit: Float[Array, " m"]
+    weights: Float[Array, "m 16"]
 
 
-def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Places]:
+def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Candidates]:
     """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
-    nodes = describe(estimate_surfels(cloud, neighbors))
-    return nodes, place(nodes, neighbors)
+    nodes = describe_nodes(estimate_surfels(cloud, neighbors))
+    return nodes, place_candidates(nodes, neighbors)
 
 
-def describe(surfels: Surfels) -> Nodes:
+def describe_nodes(surfels: Surfels) -> Nodes:
     """Node features from the surfels of a cloud."""
     position, normal, spacing, color = map(
         jnp.asarray, (surfels.position, surfels.normal, surfels.spacing, surfels.base_color)
     )
-    openness, shown = 2 * jnp.mean(surfels.visible, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
-    traits = jnp.concatenate([surfels.shape, jnp.stack([surfels.sided, openness, shown], axis=1)], axis=1)
-    return Nodes(position, normal, spacing, root(color), traits)
+    openness, shown = 2 * jnp.mean(surfels.visibility, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
+    traits = jnp.concatenate([surfels.shape_ratios, jnp.stack([surfels.one_sided, openness, shown], axis=1)], axis=1)
+    return Nodes(position, normal, spacing, safe_sqrt(color), traits)
 
 
 def propose(
@@ -113,80 +113,83 @@ def propose(
     offset = jnp.where(real[..., None], nodes.position[other] - nodes.position[:, None], 0)
     products = jnp.einsum("nai,nbi->nab", offset, offset, precision="highest")
     squared = jnp.diagonal(products, axis1=1, axis2=2)
-    to_end = root(squared[:, :, None] + squared[:, None] - 2 * products)
-    size = root(squared)
+    to_end = safe_sqrt(squared[:, :, None] + squared[:, None] - 2 * products)
+    size = safe_sqrt(squared)
     height = jnp.einsum("nai,ni->na", offset, nodes.normal)
     there = jnp.sum(offset * nodes.normal[other], axis=-1)
-    through = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
+    crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
     cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
     bent = (jnp.abs(height) + jnp.abs(there)) / reach + 1 - cosine > BENT
     sparse = jnp.sum(neighbors[:, 0] >= 0) <= SPARSE
     between = squared[:, None] - products < -BETWEEN * size[:, None] * to_end
-    blocked = jnp.any(between & (real & ~through)[:, None], axis=2)
+    blocked = jnp.any(between & (real & ~crosses_wall)[:, None], axis=2)
     listed = jnp.any(neighbors[other] == own[:, None, None], axis=-1)
     owns = ((own[:, None] + other) % 2 == 0) == (own[:, None] < other)
     fits = (size < LONGEST * reach) & (size > SHORTEST * (reach + nodes.spacing[other]))
-    pair = real & ~blocked & ~through & (owns | ~listed) & fits & (sparse | bent)
+    pair = real & ~blocked & ~crosses_wall & (owns | ~listed) & fits & (sparse | bent)
     flat = normalize((offset - height[..., None] * nodes.normal[:, None]) / reach[..., None])
-    nearest = jnp.argmin(jnp.where(real & ~through, size, jnp.inf), axis=1)[:, None, None]
-    first = complete(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
+    nearest = jnp.argmin(jnp.where(real & ~crosses_wall, size, jnp.inf), axis=1)[:, None, None]
+    first = project_to_tangent(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
     second = jnp.cross(nodes.normal, first)
-    angle = 2 * np.pi / WAYS * np.arange(WAYS)
-    ways = first[:, None] * np.cos(angle)[None, :, None] + second[:, None] * np.sin(angle)[None, :, None]
-    along = jnp.einsum("nwi,nai->nwa", ways, flat)
-    taken = (along > BESIDE) & (real & ~through & (size < NEAR * reach))[:, None]
-    free = ~jnp.any(taken, axis=2) & real[:, :1]
+    angle = 2 * np.pi / TANGENT_DIRECTIONS * np.arange(TANGENT_DIRECTIONS)
+    directions = first[:, None] * np.cos(angle)[None, :, None] + second[:, None] * np.sin(angle)[None, :, None]
+    along = jnp.einsum("nwi,nai->nwa", directions, flat)
+    closed = (along > BESIDE) & (real & ~crosses_wall & (size < NEAR * reach))[:, None]
+    free = ~jnp.any(closed, axis=2) & real[:, :1]
     ranks = jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle[None], jnp.inf)
     rank = jnp.concatenate(ranks, axis=1)
-    order = jnp.argsort(rank, axis=1)[:, :CHILDREN]
+    order = jnp.argsort(rank, axis=1)[:, :CANDIDATES]
     exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf
     ends = jnp.concatenate([other, jnp.broadcast_to(own[:, None], free.shape)], axis=1)
     ends = jnp.where(exists, jnp.take_along_axis(ends, order, axis=1), own[:, None])
-    ways = jnp.concatenate([flat, ways], axis=1)
-    return ends, exists, jnp.take_along_axis(ways, order[..., None], axis=1)
+    directions = jnp.concatenate([flat, directions], axis=1)
+    return ends, exists, jnp.take_along_axis(directions, order[..., None], axis=1)
 
 
-def complete(way: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
+def project_to_tangent(direction: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
     """Unit vectors: the directions projected to the planes of the normals; any vector of the plane if that is 0."""
     axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(3)[:1], jnp.eye(3)[1:2])
-    flat = way - jnp.sum(way * normal, axis=1, keepdims=True) * normal
+    flat = direction - jnp.sum(direction * normal, axis=1, keepdims=True) * normal
     other = axis - jnp.sum(axis * normal, axis=1, keepdims=True) * normal
     return normalize(jnp.where(jnp.sum(flat**2, axis=1, keepdims=True) > 1e-6, flat, other))
 
 
-def place(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Places:
-    """Candidates of all points, CHILDREN consecutive ones for each point."""
-    ends, exists, ways = jax.lax.stop_gradient(propose(nodes, neighbors))
+def place_candidates(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Candidates:
+    """Candidates of all points, CANDIDATES consecutive ones for each point."""
+    ends, exists, directions = jax.lax.stop_gradient(propose(nodes, neighbors))
     own = jnp.broadcast_to(jnp.arange(len(ends), dtype=ends.dtype)[:, None], ends.shape)
-    first, second, exists, ways = own.reshape(-1), ends.reshape(-1), exists.reshape(-1), ways.reshape(-1, 3)
+    first, second, exists, directions = own.reshape(-1), ends.reshape(-1), exists.reshape(-1), directions.reshape(-1, 3)
     turned = nodes.spacing[first] > nodes.spacing[second]  # not by index: points may come in any order
     turned = turned | ((nodes.spacing[first] == nodes.spacing[second]) & (first > second))
     first, second = jnp.where(turned, second, first), jnp.where(turned, first, second)
-    alone = (first == second)[:, None]
-    way, scale = nodes.position[second] - nodes.position[first], (nodes.spacing[first] + nodes.spacing[second]) / 2
+    is_open = (first == second)[:, None]
+    direction, scale = (
+        nodes.position[second] - nodes.position[first],
+        (nodes.spacing[first] + nodes.spacing[second]) / 2,
+    )
     one, two = nodes.normal[first], nodes.normal[second]
-    heights = jnp.sum(way * one, axis=1, keepdims=True), -jnp.sum(way * two, axis=1, keepdims=True)
-    curved = way / 2 - (heights[0] * one + heights[1] * two) / 8
-    middle = nodes.position[first] + jnp.where(alone, OPEN * scale[:, None] * ways, curved)
+    heights = jnp.sum(direction * one, axis=1, keepdims=True), -jnp.sum(direction * two, axis=1, keepdims=True)
+    curved = direction / 2 - (heights[0] * one + heights[1] * two) / 8
+    middle = nodes.position[first] + jnp.where(is_open, OPEN_DISTANCE * scale[:, None] * directions, curved)
     alike = jnp.sum(one * two, axis=1, keepdims=True) >= 0
     up = normalize(one + jnp.where(alike, two, -two))
-    along = complete(jnp.where(alone, ways, normalize(way / scale[:, None])), up)
+    along = project_to_tangent(jnp.where(is_open, directions, normalize(direction / scale[:, None])), up)
     frame = jnp.stack([along, jnp.cross(up, along), up], axis=1)
-    around = find_around(nodes, neighbors, first, second, jax.lax.stop_gradient(middle))
-    return Places(first, second, exists, middle, frame, scale, around)
+    around = find_nearest(nodes, neighbors, first, second, jax.lax.stop_gradient(middle))
+    return Candidates(first, second, exists, middle, frame, scale, around)
 
 
-def find_around(nodes: Nodes, neighbors: Array, first: Array, second: Array, middle: Array) -> Int[Array, "m 16"]:
+def find_nearest(nodes: Nodes, neighbors: Array, first: Array, second: Array, middle: Array) -> Int[Array, "m 16"]:
     """Indices of the points nearest to each candidate, among the neighbors of both ends; -1 for none."""
     one, two = neighbors[first], neighbors[second]
     again = jnp.any(one[:, None] == two[:, :, None], axis=2)
     number = jnp.concatenate([one, jnp.where(again, -1, two)], axis=1)
     squared = jnp.sum((nodes.position[number] - middle[:, None]) ** 2, axis=-1)
-    nearest, chosen = jax.lax.top_k(-jnp.where(number >= 0, squared, jnp.inf), AROUND)
+    nearest, chosen = jax.lax.top_k(-jnp.where(number >= 0, squared, jnp.inf), NUM_NEAREST)
     return jnp.where(nearest > -jnp.inf, jnp.take_along_axis(number, chosen, axis=1), -1)
 
 
-class Convolution(nn.Module):
+class GraphConvolution(nn.Module):
     """Features of points after one graph convolution over their neighbors (Wang et al. 2019, EdgeConv)."""
 
     def setup(self) -> None:
@@ -211,68 +214,70 @@ class Convolution(nn.Module):
 
 
 class Proposal(nn.Module):
-    """Predicts children: a PointNet over the points around each candidate, in the candidate's frame."""
+    """Predicts points: a PointNet over the points around each candidate, in the candidate's frame."""
 
     @nn.compact
-    def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], places: Places) -> Children:
+    def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], candidates: Candidates) -> LearnedPoints:
         """Residuals on the middles of the candidates; without training, the middles themselves."""
-        real = places.around >= 0
-        seen, offset = describe_points(nodes, places)
-        told = compare_ends(nodes, places)
-        element = nn.Dense(WIDTH, name="element")(seen) + nn.Dense(WIDTH, name="told")(told)[:, None]
-        element += nn.Dense(WIDTH, use_bias=False, name="neighbor")(hidden)[places.around]
+        real = candidates.around >= 0
+        point_features, offset = describe_points(nodes, candidates)
+        pair_features = compare_ends(nodes, candidates)
+        element = nn.Dense(WIDTH, name="element")(point_features) + nn.Dense(WIDTH, name="told")(pair_features)[:, None]
+        element += nn.Dense(WIDTH, use_bias=False, name="neighbor")(hidden)[candidates.around]
         element = nn.relu(nn.Dense(WIDTH, name="element1")(nn.relu(element)))
         pooled = nn.relu(nn.Dense(WIDTH, name="pool")(pool(element, real)))
         element = nn.Dense(WIDTH, name="element2")(element) + nn.Dense(WIDTH, name="back")(pooled)[:, None]
         element = nn.relu(nn.Dense(WIDTH, name="element3")(nn.relu(element)))
-        state = jnp.concatenate([pool(element, real), pooled, told], axis=1)
+        state = jnp.concatenate([pool(element, real), pooled, pair_features], axis=1)
         state = nn.relu(nn.Dense(HEAD, name="head")(state))
         state = nn.relu(nn.Dense(HEAD, name="head1")(state))
         out = nn.Dense(7, kernel_init=nn.initializers.normal(0.01), name="out")(state)
         move = clamp(out[:, :3], -1.5, 1.5)
         tilt = out[:, 3:6] + jnp.asarray([0, 0, 1], out.dtype)[None]
-        position = places.middle + places.scale[:, None] * turn(move, places.frame)
-        normal = normalize(turn(tilt, places.frame))
+        position = candidates.middle + candidates.scale[:, None] * rotate(move, candidates.frame)
+        normal = normalize(rotate(tilt, candidates.frame))
         near = jnp.sum((offset - move[:, None]) ** 2, axis=-1)
-        facing = jnp.einsum("mki,mi->mk", nodes.normal[places.around], normal)
+        facing = jnp.einsum("mki,mi->mk", nodes.normal[candidates.around], normal)
         sharp = self.param("sharp", nn.initializers.constant(2.0), (2,))
         preferred = nn.Dense(1, name="material")(element)[..., 0] - sharp[0] * near + sharp[1] * facing
-        shares = jax.nn.softmax(jnp.where(real, preferred, -1e9), axis=1)
-        return Children(position, move, normal, out[:, 6], shares)
+        weights = jax.nn.softmax(jnp.where(real, preferred, -1e9), axis=1)
+        return LearnedPoints(position, move, normal, out[:, 6], weights)
 
 
-def init(key: Key, nodes: Nodes, places: Places) -> dict:
+def init(key: Key, nodes: Nodes, candidates: Candidates) -> dict:
     """Fresh weights of the network."""
     keys = jax.random.split(key, CONVOLUTIONS + 2)
     hidden, point = nn.Dense(FEATURES).init_with_output(keys[0], nodes.traits)
     edges, real = jnp.zeros((len(hidden), 1, EDGE)), jnp.ones((len(hidden), 1), bool)
     params = {"point": point["params"]}
     for number in range(CONVOLUTIONS):
-        params[f"graph{number}"] = Convolution().init(keys[1 + number], hidden, edges, real, method="first")["params"]
-    return params | {"proposal": Proposal().init(keys[-1], nodes, hidden, places)["params"]}
+        params[f"graph{number}"] = GraphConvolution().init(keys[1 + number], hidden, edges, real, method="first")[
+            "params"
+        ]
+    return params | {"proposal": Proposal().init(keys[-1], nodes, hidden, candidates)["params"]}
 
 
-def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places) -> Children:
-    """The children of the candidates: graph convolutions, then a PointNet for each candidate, in blocks."""
+def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], candidates: Candidates) -> LearnedPoints:
+    """The points predicted for the candidates: graph convolutions, then a PointNet for each candidate, in blocks."""
     hidden: Any = nn.Dense(FEATURES).apply({"params": params["point"]}, nodes.traits)
     around = neighbors[:, 1:]
-    edges = relate(nodes, around)
+    edges = describe_edges(nodes, around)
     for number in range(CONVOLUTIONS):
         hidden = convolve(params[f"graph{number}"], hidden, edges, around, neighbors[:, 0] >= 0)
 
-    def propose_in(block: Places) -> Any:
+    def predict_block(block: Candidates) -> Any:
         return Proposal().apply({"params": params["proposal"]}, nodes, hidden, block)
 
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propose_in, places))
-    return map_existing(propose_in, places.exists, (places,), empty, BLOCK)
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(predict_block, candidates))
+    return map_existing(predict_block, candidates.exists, (candidates,), empty, BLOCK)
 
 
 def convolve(params: dict, hidden: Array, edges: Array, around: Array, exists: Array) -> Any:
     """Features of the points after one graph convolution, in blocks."""
-    sent: Any = Convolution().apply({"params": params}, hidden, method="send")
+    sent: Any = GraphConvolution().apply({"params": params}, hidden, method="send")
 
     def one(hidden: Array, edges: Array, around: Array) -> Any:
-        return Convolution().apply({"params": params}, hidden, sent[around], edges, around >= 0)
+        return GraphConvolution().apply({"params": params}, hidden, sent[around], edges, around >= 0)
 
     return map_existing(one, exists, (hidden, edges, around), jnp.zeros_like(hidden), BLOCK)
 
@@ -284,131 +289,133 @@ def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array
     return jnp.concatenate([jnp.max(values, axis=1), mean], axis=1)
 
 
-def turn(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Array, "m 3"]:
+def rotate(vectors: Float[Array, "m 3"], frame: Float[Array, "m 3 3"]) -> Float[Array, "m 3"]:
     """Vectors given in local frames, in the axes of the cloud."""
     return jnp.einsum("mj,mji->mi", vectors, frame, precision="highest")
 
 
-def relate(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
+def describe_edges(nodes: Nodes, around: Int[Array, "n k"]) -> Float[Array, "n k 9"]:
     """Rotation-invariant features of each edge from a point to a neighbor."""
     spacing = nodes.spacing[:, None]
     offset = (nodes.position[around] - nodes.position[:, None]) / spacing[..., None]
     normal, other = nodes.normal[:, None], nodes.normal[around]
     height, from_there = jnp.sum(offset * normal, axis=-1), -jnp.sum(offset * other, axis=-1)
     far = length(offset)
-    beside = root(far**2 - height**2)
+    beside = safe_sqrt(far**2 - height**2)
     unlike = length(nodes.color[around] - nodes.color[:, None])
     coarse = jnp.log(nodes.spacing[around] / spacing)
     parts = [height, from_there, far, jnp.exp(-far), beside, jnp.sum(normal * other, axis=-1), coarse]
     return clamp(jnp.stack([*parts, unlike, jnp.exp(-8 * unlike)], axis=-1), -8, 8)
 
 
-def describe_points(nodes: Nodes, places: Places) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
+def describe_points(nodes: Nodes, candidates: Candidates) -> tuple[Float[Array, "m k 14"], Float[Array, "m k 3"]]:
     """Features of the points around each candidate, and their offsets in its frame and scale."""
-    number, scale = places.around, places.scale[:, None]
-    way = (nodes.position[number] - places.middle[:, None]) / scale[..., None]
-    offset = clamp(jnp.einsum("mki,mji->mkj", way, places.frame), -8, 8)
-    normal = jnp.einsum("mki,mji->mkj", nodes.normal[number], places.frame)
+    number, scale = candidates.around, candidates.scale[:, None]
+    way = (nodes.position[number] - candidates.middle[:, None]) / scale[..., None]
+    offset = clamp(jnp.einsum("mki,mji->mkj", way, candidates.frame), -8, 8)
+    normal = jnp.einsum("mki,mji->mkj", nodes.normal[number], candidates.frame)
     far = length(offset)
-    color = (nodes.color[places.first] + nodes.color[places.second]) / 2
+    color = (nodes.color[candidates.first] + nodes.color[candidates.second]) / 2
     unlike = length(nodes.color[number] - color[:, None])
-    ends = [number == x[:, None] for x in (places.first, places.second)]
+    ends = [number == x[:, None] for x in (candidates.first, candidates.second)]
     coarse = jnp.log(nodes.spacing[number] / scale)
     height = -jnp.sum(offset * normal, axis=-1)
     parts = [far, jnp.exp(-(far**2)), height, coarse, unlike, jnp.exp(-8 * unlike), *ends]
     return jnp.concatenate([offset, normal, jnp.stack(parts, axis=-1)], axis=-1), offset
 
 
-def compare_ends(nodes: Nodes, places: Places) -> Float[Array, "m 7"]:
+def compare_ends(nodes: Nodes, candidates: Candidates) -> Float[Array, "m 7"]:
     """Features that compare the two ends of each candidate."""
-    one, two = places.first, places.second
-    way = (nodes.position[two] - nodes.position[one]) / places.scale[:, None]
-    heights = [jnp.sum(way * nodes.normal[x], axis=1) for x in (one, two)]
+    one, two = candidates.first, candidates.second
+    direction = (nodes.position[two] - nodes.position[one]) / candidates.scale[:, None]
+    heights = [jnp.sum(direction * nodes.normal[x], axis=1) for x in (one, two)]
     cosine = jnp.sum(nodes.normal[one] * nodes.normal[two], axis=1)
     unlike = length(nodes.color[one] - nodes.color[two])
     coarse = jnp.log(nodes.spacing[two] / nodes.spacing[one])
-    parts = [length(way), *heights, cosine, unlike, coarse, (one == two).astype(cosine.dtype)]
+    parts = [length(direction), *heights, cosine, unlike, coarse, (one == two).astype(cosine.dtype)]
     return clamp(jnp.stack(parts, axis=1), -8, 8)
 
 
-def blend(shares: Float[Array, "m k"], values: Float[Array, "m k ..."]) -> Float[Array, "m ..."]:
+def weigh_rows(weights: Float[Array, "m k"], values: Float[Array, "m k ..."]) -> Float[Array, "m ..."]:
     """Weighted sums of the values."""
-    return jnp.einsum("mk,mk...->m...", shares, values, precision="highest")
+    return jnp.einsum("mk,mk...->m...", weights, values, precision="highest")
 
 
-def choose(nodes: Nodes, neighbors: Int[Array, "n 20"], places: Places, children: Children) -> Bool[Array, " m"]:
-    """Which children are kept: likely ones that are not too close to each other or to a measured point.
+def select_points(
+    nodes: Nodes, neighbors: Int[Array, "n 20"], candidates: Candidates, learned: LearnedPoints
+) -> Bool[Array, " m"]:
+    """Which predicted points are kept: likely ones that are not too close to each other or to a measured point.
 
-    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the children
+    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the points
     that beat all their rivals (maximal independent set, Luby 1986), so the order of points does not matter.
     """
     count = len(neighbors)
     near = neighbors[:, :12]
-    fixed = (nodes, children, places.scale, places.exists)
-    nodes, children, scale, exists = jax.lax.stop_gradient(fixed)
-    position, normal = (x.reshape(count, CHILDREN, 3) for x in (children.position, children.normal))
-    closest = CLOSEST * scale.reshape(count, CHILDREN, 1)
+    fixed = (nodes, learned, candidates.scale, candidates.exists)
+    nodes, learned, scale, exists = jax.lax.stop_gradient(fixed)
+    position, normal = (x.reshape(count, CANDIDATES, 3) for x in (learned.position, learned.normal))
+    closest = LEAST_DISTANCE * scale.reshape(count, CANDIDATES, 1)
 
     def compare(others: Array, facing: Array) -> Array:
-        """Squared distances over CLOSEST squared, plus a term for different normals; below 1 is too close."""
+        """Squared distances over LEAST_DISTANCE squared, plus a term for different normals; below 1 is too close."""
         far = jnp.sum((others[:, None] - position[:, :, None]) ** 2, axis=-1)
         unlike = 1 - jnp.einsum("nki,nci->nck", facing, normal, precision="highest")
-        return far / closest**2 + AWAY * unlike
+        return far / closest**2 + NORMAL_PENALTY * unlike
 
     measured = jnp.where((near >= 0)[:, None], compare(nodes.position[near], nodes.normal[near]), jnp.inf)
     gap = jnp.min(measured, axis=2)
-    likely = jax.nn.sigmoid(children.odds).reshape(count, CHILDREN)
-    open_ = exists.reshape(count, CHILDREN) & (likely > LIKELY) & (gap > 1)
-    worth = jnp.where(open_, likely * jnp.minimum(gap, FARTHEST), 0)
-    number = (near[..., None] * CHILDREN + jnp.arange(CHILDREN)[None, None]).reshape(count, 1, -1)
-    own = jnp.arange(count * CHILDREN).reshape(count, CHILDREN, 1)
+    likely = jax.nn.sigmoid(learned.logit).reshape(count, CANDIDATES)
+    candidate = exists.reshape(count, CANDIDATES) & (likely > LEAST_PROBABILITY) & (gap > 1)
+    worth = jnp.where(candidate, likely * jnp.minimum(gap, LARGEST_GAP), 0)
+    number = (near[..., None] * CANDIDATES + jnp.arange(CANDIDATES)[None, None]).reshape(count, 1, -1)
+    own = jnp.arange(count * CANDIDATES).reshape(count, CANDIDATES, 1)
     rivals = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3)) < 1
-    rivals = rivals & (number != own) & jnp.repeat(near >= 0, CHILDREN, axis=1)[:, None]
+    rivals = rivals & (number != own) & jnp.repeat(near >= 0, CANDIDATES, axis=1)[:, None]
     other = worth.reshape(-1)[number]
     better = rivals & ((other > worth[..., None]) | ((other == worth[..., None]) & (number < own)))
 
     def decide(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        kept, asked = state
-        best = asked & ~jnp.any(better & asked.reshape(-1)[number], axis=2)
+        kept, undecided = state
+        best = undecided & ~jnp.any(better & undecided.reshape(-1)[number], axis=2)
         lost = jnp.any(rivals & best.reshape(-1)[number], axis=2)
-        return kept | best, asked & ~best & ~lost
+        return kept | best, undecided & ~best & ~lost
 
-    return jax.lax.fori_loop(0, ROUNDS, decide, (jnp.zeros_like(open_), open_))[0].reshape(-1)
+    return jax.lax.fori_loop(0, ROUNDS, decide, (jnp.zeros_like(candidate), candidate))[0].reshape(-1)
 
 
 def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
-    """The cloud (unbatched, any units), then CHILDREN slots for each of its points; `mask` is True for the kept ones.
+    """The cloud (unbatched, any units), then CANDIDATES slots for each of its points; `mask` is True for the kept ones.
 
     Pure, of static size: jit, vmap over equally padded clouds, grad.  `params` are the model's, `neighbors` those of
     `spnr_jax.neighbors(cloud)`; find them anew for the result before `encode`.  All points of the result have normals:
-    given, estimated or predicted.  `invented` is 0 for measured points.  UserError for params without a densifier.
+    given, estimated or predicted.  `learned` is 0 for measured points.  UserError for params without a densifier.
     """
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
-    inside, centre, scale = move_into_box(cloud)
+    inside, centre, scale = normalise_cloud(cloud)
     dense = densify_in_box(params["densifier"], inside, neighbors)
-    children = dense.positions[len(cloud.mask) :] / scale + centre[None]
-    return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), children]))
+    learned = dense.positions[len(cloud.mask) :] / scale + centre[None]
+    return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), learned]))
 
 
 def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
     """`densify` of a cloud in the box."""
     neighbors = jnp.asarray(neighbors)
-    nodes, places = build_graph(cloud, neighbors)
-    children = predict(params, nodes, neighbors, places)
+    nodes, candidates = build_graph(cloud, neighbors)
+    learned = predict(params, nodes, neighbors, candidates)
 
     def extend(column: AnyArray, more: Array | None = None) -> Array:
         values = jnp.asarray(column)
-        more = blend(children.shares, values[places.around]) if more is None else more
+        more = weigh_rows(learned.weights, values[candidates.around]) if more is None else more
         return jnp.concatenate([values, more])
 
     return PointCloud(
-        positions=extend(cloud.positions, clamp(children.position, -1, 1)),
-        base_color=extend(cloud.base_color, blend(children.shares, nodes.color[places.around]) ** 2),
+        positions=extend(cloud.positions, clamp(learned.position, -1, 1)),
+        base_color=extend(cloud.base_color, weigh_rows(learned.weights, nodes.color[candidates.around]) ** 2),
         roughness=extend(cloud.roughness),
         metallic=extend(cloud.metallic),
-        mask=extend(cloud.mask, choose(nodes, neighbors, places, children)),
-        normals=extend(nodes.normal, children.normal),
+        mask=extend(cloud.mask, select_points(nodes, neighbors, candidates, learned)),
+        normals=extend(nodes.normal, learned.normal),
         materials_known=None if cloud.materials_known is None else extend(cloud.materials_known),
-        invented=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(children.odds) / 2),
+        learned=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(learned.logit) / 2),
     )

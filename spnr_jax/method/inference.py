@@ -77,9 +77,9 @@ def loss(
     if config.loss.opacity_weight:
         opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
         terms["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
-    seen = rendering.acc > 0 if config.loss.masked else None
+    mask = rendering.acc > 0 if config.loss.masked else None
     reference = jnp.asarray(batch.image)
-    value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, seen)
+    value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, mask)
     metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
     return sum(terms.values(), value), Outcome(metrics | terms, updated.get("batch_stats", {}), rendering.image, batch)
 
@@ -88,7 +88,7 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     """The batch with every `stride`-th row and column of its views, from a random offset: still an image."""
     first = jax.random.randint(key, (2,), 0, stride)
 
-    def thinned(x):
+    def thin(x):
         for axis, start in zip((2, 3), first, strict=True):
             x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
             x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
@@ -99,18 +99,18 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
     intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
     images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (thinned(jnp.asarray(x)) for x in images)
+    image, alpha, condition, mask = (thin(jnp.asarray(x)) for x in images)
     pose, (height, width) = batch.camera.cam_to_world, image.shape[2:4]
     camera = Camera(cam_to_world=pose, intrinsics=intrinsics, height=height, width=width)
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
-def pixel_error(config: TrainConfig, image: Array, reference: Array, seen: Array | None = None) -> Float[Array, ""]:
-    """Mean error over all pixels, or over those where `seen` is True (0 if there are none)."""
-    if seen is None:
+def pixel_error(config: TrainConfig, image: Array, reference: Array, mask: Array | None = None) -> Float[Array, ""]:
+    """Mean error over all pixels, or over those where `mask` is True (0 if there are none)."""
+    if mask is None:
         return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
     error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
-    return jnp.sum(jnp.where(seen[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(seen), 1)
+    return jnp.sum(jnp.where(mask[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(mask), 1)
 
 
 def reconstruction_loss(
@@ -118,10 +118,10 @@ def reconstruction_loss(
     image: Float[Array, "*batch"],
     image_lr: Float[Array, "*batch_lr"],
     reference: Array,
-    seen: Array | None = None,
+    mask: Array | None = None,
 ) -> Float[Array, ""]:
     """Weighted errors of the image, and of the low-resolution rendering against the downsampled reference."""
-    error = pixel_error(config, image, reference, seen)
+    error = pixel_error(config, image, reference, mask)
     if config.model.upsamples:
         low = losses.area_downsample(reference, image_lr.shape[-2])
         error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
@@ -185,7 +185,7 @@ def _render(
     options: RenderOptions | None,
 ) -> Rendering:
     """One view; depth in the cloud's units."""
-    scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.in_box(camera, centre, scale)))
+    scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.move_into_box(camera, centre, scale)))
     rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config, options=options)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0], rendering)

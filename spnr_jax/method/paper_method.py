@@ -1,9 +1,9 @@
 """The paper's method on one page: points -> volume -> features along rays -> image.
 
-    encode   PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)        once per object
-    render   64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
-    trace    all rays: empty ones are skipped, the others rendered in blocks on the device of their object
-    march    rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
+    encode        PointNet on every point, mean per voxel, 3D U-Net (`nn/paper_layers.py`)        once per object
+    render        64 x 64 rays, 64 coarse and 64 fine samples, field, compositing, 2D upsampler   once per view
+    render_rays   empty rays are skipped, the others rendered in blocks on the device of their object
+    march         rays of a block: coarse samples, fine samples where the coarse weights are large, compositing
 
 It uses the loss of Linen modules (`inference.loss`) and a discriminator.  The first axis is objects, the second views:
 clouds are (objects, points, ...), cameras (objects, views, ...).  A *field* is a function from distances along rays
@@ -26,10 +26,10 @@ from scipy.spatial import cKDTree
 from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
-from spnr_jax.kernels.imaging import WHITE, bilinear
+from spnr_jax.kernels.imaging import WHITE, resize_bilinear
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Key, Light, PointCloud, Rays, Rendering, Scene, Volume
-from spnr_jax.kernels.voxels import Path
+from spnr_jax.kernels.voxels import RayPath
 from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsampler
 
@@ -38,7 +38,7 @@ REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 409
 CELLS_PER_VOXEL = 1  # along an axis: cells of the path of a ray through the box
 RAY_BLOCK = 256  # rays near points that are rendered at once
 CPU_BLOCK = 64  # the same on a CPU outside of training: what a block reads stays in the first-level cache
-LOOKED_AT = 2**14  # rays that are tested at once for whether they hit anything
+HIT_BLOCK = 2**14  # rays that are tested at once for whether they hit anything
 
 
 class Samples(NamedTuple):
@@ -48,7 +48,7 @@ class Samples(NamedTuple):
     summed: Any
 
 
-class Seen(NamedTuple):
+class CompositedRays(NamedTuple):
     """Rays after compositing: the composited values `summed`, opacity, and expected distance."""
 
     summed: Any
@@ -56,7 +56,7 @@ class Seen(NamedTuple):
     depth: Array
 
 
-class Traced(NamedTuple):
+class RenderedRays(NamedTuple):
     """Rays of objects: features (the first three are RGB on white), expected distance, opacity."""
 
     features: Float[Array, "*rays k"]
@@ -65,7 +65,7 @@ class Traced(NamedTuple):
 
 
 Field = Callable[[Float[Array, "*rays samples"]], Samples]
-Finish = Callable[[Seen], Float[Array, "*rays k"]]
+Decode = Callable[[CompositedRays], Float[Array, "*rays k"]]
 
 
 class PaperNetwork(nn.Module):
@@ -92,7 +92,7 @@ class PaperNetwork(nn.Module):
     ) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
         samples = options.sampling or self.config.sampling
-        return self.develop(camera, trace(self, scene, self.rays(camera), samples, options, key))
+        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options, key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -103,31 +103,31 @@ class PaperNetwork(nn.Module):
         ratio = self.config.render_resolution / self.config.image_resolution
         return round(camera.height * ratio), round(camera.width * ratio)
 
-    def along(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Finish]:
+    def make_field(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Decode]:
         """The field along rays (density, emitted values), and the function from composited values to features."""
         view = self.field.view(rays.directions)
 
         def field(distances: Float[Array, "*rays samples"]) -> Samples:
             owners = jnp.broadcast_to(objects[..., None], distances.shape)
-            return Samples(*self.field(voxels.trilinear(scene.volume, places(rays, distances), owners), view))
+            return Samples(*self.field(voxels.trilinear(scene.volume, locate_samples(rays, distances), owners), view))
 
-        def finish(seen: Seen) -> Float[Array, "*rays features"]:
-            return self.field.finish(seen.summed, seen.acc, view)
+        def decode(composited: CompositedRays) -> Float[Array, "*rays features"]:
+            return self.field.decode(composited.summed, composited.acc, view)
 
-        return field, finish
+        return field, decode
 
-    def develop(self, camera: Camera, traced: Traced) -> Rendering:
+    def decode_images(self, camera: Camera, rendered: RenderedRays) -> Rendering:
         """Images from the rays of `rays`: the feature image is resized, and the upsampler doubles it."""
         views, (height, width) = camera.cam_to_world.shape[:-2], self.render_size(camera)
-        features = traced.features.reshape(-1, height, width, self.config.num_features)
+        features = rendered.features.reshape(-1, height, width, self.config.num_features)
         image = features[..., :3]
         if self.config.upsamples:
-            image = self.upsampler(bilinear(features, camera.height // 2, camera.width // 2))
+            image = self.upsampler(resize_bilinear(features, camera.height // 2, camera.width // 2))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
             image_lr=features[..., :3].reshape(*views, height, width, 3),
-            depth=traced.depth.reshape(*views, height, width),
-            acc=traced.acc.reshape(*views, height, width),
+            depth=rendered.depth.reshape(*views, height, width),
+            acc=rendered.acc.reshape(*views, height, width),
         )
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
@@ -138,13 +138,13 @@ class PaperNetwork(nn.Module):
 # --- rays -------------------------------------------------------------------------------------------------------------
 
 
-def trace(
+def render_rays(
     module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, options: RenderOptions, key: Key | None
-) -> Traced:
+) -> RenderedRays:
     """Renders rays (objects, rays, ...).  A key jitters the samples; each ray folds in its own number.
 
-    The network is a bound Linen module.  `along(scene, rays, objects)` gives its field and the function from `Seen` to
-    features; `config.num_features` is the number of features of a ray.
+    The network is a bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from
+    `CompositedRays` to features; `config.num_features` is the number of features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
@@ -152,11 +152,11 @@ def trace(
         return _on_one_device(lambda: module, scene, rays, number, samples, options, key)
     network, variables = module.unbind()  # transformations of JAX must not close over a bound module
 
-    def own(whole, scene, own_rays):
+    def render_own(whole, scene, own_rays):
         variables, key = whole
         return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, options, key)
 
-    return split_objects(own, (variables, key), scene, (rays, number))
+    return split_objects(render_own, (variables, key), scene, (rays, number))
 
 
 def _on_one_device(
@@ -167,34 +167,34 @@ def _on_one_device(
     samples: SamplingConfig,
     options: RenderOptions,
     key: Key | None,
-) -> Traced:
-    """`trace` of the rays that lie on one device."""
+) -> RenderedRays:
+    """`render_rays` of the rays that lie on one device."""
     shape = number.shape
     objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
     inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays))
     near_points = voxels.dilate(scene.occupied, samples.reach) if samples.reach else None
 
     def block(objects, number, rays):
-        field, finish = bound().along(scene, rays, objects)
+        field, decode = bound().make_field(scene, rays, objects)
         keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-        seen = march(field, _path(near_points, rays, objects), samples, keys)
-        return Traced(finish(seen), seen.depth, seen.acc)
+        composited = march(field, _path(near_points, rays, objects), samples, keys)
+        return RenderedRays(decode(composited), composited.depth, composited.acc)
 
     size = options.block
     if size is None and samples.reach:
         size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
     if size is None or bound().is_initializing():  # at initialisation there are no weights yet that a block could read
-        traced = block(*inputs)
+        rendered = block(*inputs)
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(WHITE)
-        nothing = Traced(white, far, jnp.zeros_like(far))
-        traced = voxels.map_existing(block, _meets(near_points, rays, objects), inputs, nothing, size)
-    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), traced)
+        nothing = RenderedRays(white, far, jnp.zeros_like(far))
+        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, nothing, size)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rendered)
 
 
-def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> Path:
+def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, "*rays"]) -> RayPath:
     """The sampled part of each ray: its segments near points, or all of it inside the box."""
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
@@ -202,19 +202,19 @@ def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects:
     return voxels.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
 
 
-def _meets(
+def _find_hits(
     near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects: Int[Array, " rays"]
 ) -> Bool[Array, " rays"]:
     """Whether a ray has anything to sample; paths are large, so they are not stored."""
-    return jax.lax.map(lambda x: _path(near_points, *x).travelled[-1] > 0, (rays, objects), batch_size=LOOKED_AT)
+    return jax.lax.map(lambda x: _path(near_points, *x).travelled[-1] > 0, (rays, objects), batch_size=HIT_BLOCK)
 
 
-def places(rays: Rays, distances: Float[Array, "*rays samples"]) -> Float[Array, "*rays samples 3"]:
+def locate_samples(rays: Rays, distances: Float[Array, "*rays samples"]) -> Float[Array, "*rays samples 3"]:
     """Positions of samples, clamped to the box: rays end on its faces, and rounding must not push samples out."""
     return clamp(rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :], -1, 1)
 
 
-def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> Seen:
+def march(field: Field, path: RayPath, counts: SamplingConfig, key: Key | None) -> CompositedRays:
     """Renders a field along paths; `key` is one key for all rays, or one per ray."""
     coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
     length, far = path.travelled[..., -1], path.edges[..., -1]
@@ -236,7 +236,7 @@ def march(field: Field, path: Path, counts: SamplingConfig, key: Key | None) -> 
         jax.tree.map(partial(compositing.composite, share), samples.summed)
         for share, samples in zip(shares, passes, strict=True)
     ]
-    return Seen(
+    return CompositedRays(
         summed=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
         acc=jnp.sum(weights, axis=-1),
         depth=compositing.expected_distance(weights, voxels.distance_at(path, travelled), far),
@@ -267,7 +267,7 @@ def encode(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched), and how far from its points rays are sampled."""
-    reach = reach_of(np.asarray(cloud.positions)[np.asarray(cloud.mask)], config.encoder.volume_resolution)
+    reach = estimate_reach(np.asarray(cloud.positions)[np.asarray(cloud.mask)], config.encoder.volume_resolution)
     volume = inference.encode_volume(variables, cloud, centre, scale, config=config)
     return dataclasses.replace(volume, reach=reach)
 
@@ -282,11 +282,11 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other, with the number of samples of a quality level."""
-    options = at_quality(config, quality, volume.reach)
+    options = choose_options(config, quality, volume.reach)
     return inference.draw_each(variables, volume, views, lights, config=config, options=options)
 
 
-def at_quality(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:
+def choose_options(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:
     """The rendering options of a quality level, with samples only within `reach` voxels of points."""
     if quality == "trained":
         return None
@@ -301,7 +301,7 @@ def discriminator(config: TrainConfig) -> Discriminator:
     return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 
-def reach_of(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+def estimate_reach(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
     """Distance from points, in voxels, within which the surface lies; from the median distance to the nearest neighbor.
 
     Duplicates of a point (closer than 1/1024 of the box) count once.

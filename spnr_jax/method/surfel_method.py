@@ -15,23 +15,23 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from spnr_jax.config import SurfelConfig
-from spnr_jax.devices.programs import Kept
+from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Blended, Sizes
+from spnr_jax.method.surfel_renderer import Sizes, WindowBuffer
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
-from spnr_jax.surfels.layers import RULES
+from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.lighting import room_light
 
 BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
 
 
-class Asked(NamedTuple):
+class PlannedView(NamedTuple):
     """A view with its light, and its requirements: the camera that is drawn, doublings and side, sizes."""
 
     camera: Camera
@@ -72,7 +72,7 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
     """A sparse cloud in the box (unbatched) with learned points added, if the variables include a densifier."""
     count = int(np.sum(cloud.mask))
-    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.invented is not None:
+    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     padded = cloud_arrays.pad(cloud_arrays.strip(cloud), cloud_arrays.bucket(count))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
@@ -88,56 +88,52 @@ def render(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
-    shader, share = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
-    asked = [prepare_view(volume.scene, view, light, share) for view, light in zip(views, lights, strict=True)]
+    weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
+    planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     common = {
-        of.resolution: surfel_renderer.largest(x.needed for x in asked if x.resolution == of.resolution) for of in asked
+        of.resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == of.resolution)
+        for of in planned
     }
 
-    def one(of: Asked, whole: Camera) -> Rendering:
-        drawn = draw_planned(shader, volume, of, common[of.resolution])
-        return drawn if share == 1 else _enlarge(drawn, whole.height, whole.width)
+    def draw(view: PlannedView, whole: Camera) -> Rendering:
+        if view.needed.entries:
+            plan = surfel_renderer.round_sizes(common[view.resolution], *view.resolution)
+            window_buffer = _rasterize(volume.scene, view.camera, view.light, plan=plan)
+            drawn = _shade(weights, volume.scene, view.camera, view.light, window_buffer, plan=plan)
+        else:
+            drawn = _leave_empty(volume.scene, view.camera)
+        return drawn if render_scale == 1 else _enlarge(drawn, whole.height, whole.width)
 
-    if len(views) == 1:
-        yield one(asked[0], views[0])
-    else:
-        yield from two_at_a_time(lambda both: one(*both), zip(asked, views, strict=True))
+    yield from two_at_a_time(lambda both: draw(*both), zip(planned, views, strict=True))
 
 
-def prepare_view(scene: SurfelScene, camera: Camera, light: Light | None, share: float) -> Asked:
+def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_scale: float) -> PlannedView:
     """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
-    if share != 1:
-        camera = cameras.resize(camera, *(max(round(share * n / 4) * 4, 4) for n in (camera.height, camera.width)))
-    doublings, side = surfel_renderer.resolution(scene, camera, share)
+    if render_scale != 1:
+        camera = cameras.resize(
+            camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
+        )
+    doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
     needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
-    return Asked(camera, light or room_light(), (doublings, side), needed)
+    return PlannedView(camera, light or room_light(), (doublings, side), needed)
 
 
-def draw_planned(variables: dict | None, volume: Volume, asked: Asked, sizes: Sizes) -> Rendering:
-    """A view drawn with arrays of these sizes."""
-    if not asked.needed.entries:
-        return _leave_empty(volume.scene, asked.camera)
-    plan = surfel_renderer.round_sizes(sizes, *asked.resolution)
-    blended = _blend(volume.scene, asked.camera, asked.light, plan=plan)
-    return _shade(variables, volume.scene, asked.camera, asked.light, blended, plan=plan)
-
-
-@partial(Kept, returns=(SurfelScene, Surfels), options=QUICKEST)
+@partial(CachedProgram, returns=(SurfelScene, Surfels), options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
-    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), RULES)
+    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), CONSTANTS)
 
 
-_densify = Kept(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
-_blend = Kept(surfel_renderer.blend_window, static="plan", returns=(Blended, GBuffer))
-_shade = Kept(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
+_densify = CachedProgram(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
+_rasterize = CachedProgram(surfel_renderer.rasterize_window, static="plan", returns=(WindowBuffer, GBuffer))
+_shade = CachedProgram(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
 _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 
 @jax.jit
 def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
     """An empty view: the object is not visible."""
-    inside = cameras.in_box(camera, scene.centre, scene.scale)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
-    image, depth, acc = surfel_renderer.paste(*nothing, inside, 1)
+    image, depth, acc = surfel_renderer.paste_window(*nothing, inside, 1)
     overflow = jnp.zeros((), jnp.int32)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=overflow)

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.devices.programs import Kept
+from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import WHITE, double_size, mean_of_squares
+from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
     AnyArray,
@@ -36,7 +36,7 @@ from spnr_jax.kernels.records import (
     unstack,
 )
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, picture
+from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, compose_picture
 from spnr_jax.surfels import lighting, splatting
 from spnr_jax.surfels.splatting import MOST_ENTRIES
 
@@ -93,40 +93,42 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     each = int(np.prod(batch[len(objects) :], dtype=int))
     scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
-    doublings, side = min((resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
+    doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
-    return round_sizes(largest(needed), doublings, side)
+    return round_sizes(max_sizes(needed), doublings, side)
 
 
-def resolution(scene: SurfelScene, camera: Camera, share: float = 1.0) -> tuple[int, int]:
+def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
     """Doublings by the network, and `side`, from the scene's spacing in pixels at its centre.
 
-    `share` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
+    `render_scale` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
     """
     eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
-    pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / share / max(distance, 1e-3)
+    pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / render_scale / max(distance, 1e-3)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
-    finest = FINEST_OF_SMALL if max(camera.height, camera.width) / share <= SMALL else FINEST
+    finest = FINEST_OF_SMALL if max(camera.height, camera.width) / render_scale <= SMALL else FINEST
     return doublings, 2 if pixels < finest else 1
 
 
-@partial(Kept, static=("doublings", "side"), returns=(Sizes,))
+@partial(CachedProgram, static=("doublings", "side"), returns=(Sizes,))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
-    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), doublings, side)
+    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
     window = crop_camera(whole, corner, width, height)
-    foot = splatting.footprints(scene.surfels, window)
-    return Sizes(width, height, splatting.count_entries(foot.covered), splatting.count_covered(foot, _most(whole)))
+    foot = splatting.project_discs(scene.surfels, window)
+    return Sizes(
+        width, height, splatting.count_entries(foot.covered), splatting.count_covered(foot, _largest_window(whole))
+    )
 
 
-def _most(camera: Camera) -> tuple[int, int]:
+def _largest_window(camera: Camera) -> tuple[int, int]:
     """Largest rows and columns of a window: it begins inside the picture and may extend beyond it."""
     return camera.height + MARGIN + STEP, camera.width + MARGIN + STEP
 
 
-def largest(needed: Iterable[Sizes]) -> Sizes:
+def max_sizes(needed: Iterable[Sizes]) -> Sizes:
     """Sizes that suffice for each of several."""
     return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
 
@@ -155,7 +157,7 @@ def scale_camera(camera: Camera, doublings: int, side: int) -> Camera:
 
 def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
     """Corner (column, row), width and height of the window around the visible surfels."""
-    foot = splatting.footprints(surfels, camera)
+    foot = splatting.project_discs(surfels, camera)
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
@@ -194,8 +196,8 @@ def render(
     """
     _check(scene, camera, light, plan)
     light = lighting.room_light() if light is None else light
-    blended = blend_window(scene, camera, light, plan=plan)
-    return shade_window(params, scene, camera, light, blended, plan=plan)
+    window_buffer = rasterize_window(scene, camera, light, plan=plan)
+    return shade_window(params, scene, camera, light, window_buffer, plan=plan)
 
 
 def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
@@ -213,7 +215,7 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
 
 
-class Blended(NamedTuple):
+class WindowBuffer(NamedTuple):
     """The G-buffer of a picture's window, the window's corner (column, row), and the overflow."""
 
     buffer: GBuffer
@@ -221,14 +223,14 @@ class Blended(NamedTuple):
     overflow: Int[Array, ""]
 
 
-def blend_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> Blended:
+def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
-    whole = scale_camera(cameras.in_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
+    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
     corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
     window = crop_camera(whole, corner, plan.width, plan.height)
-    buffer, lost = rasterize(scene.surfels, window, light, room=plan.entries, slots=plan.slots)
+    buffer, overflow = rasterize(scene.surfels, window, light, capacity=plan.entries, slots=plan.slots)
     beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
-    return Blended(buffer, corner, jnp.minimum(lost, splatting.MOST) + beyond)
+    return WindowBuffer(buffer, corner, jnp.minimum(overflow, splatting.MOST_COUNTED) + beyond)
 
 
 def shade_window(
@@ -236,26 +238,26 @@ def shade_window(
     scene: SurfelScene,
     camera: Camera,
     light: Light,
-    blended: Blended,
+    window_buffer: WindowBuffer,
     *,
     plan: Plan,
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
-    inside = cameras.in_box(camera, scene.centre, scene.scale)
-    window = crop_camera(scale_camera(inside, plan.doublings, plan.side), blended.corner, plan.width, plan.height)
-    drawn = shade(params, *prepare_inputs(blended.buffer, light, window), doublings=plan.doublings)
-    image, depth, acc = paste(drawn, blended.corner * 2**plan.doublings, inside, plan.side)
-    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=blended.overflow)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
+    window = crop_camera(scale_camera(inside, plan.doublings, plan.side), window_buffer.corner, plan.width, plan.height)
+    drawn = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
+    image, depth, acc = paste_window(drawn, window_buffer.corner * 2**plan.doublings, inside, plan.side)
+    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
 
 def rasterize(
-    surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
+    surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """The G-buffer of a view, with the light that surfels receive; and how many entries and pixels did not fit."""
-    found, lost = splatting.entries(surfels, camera, room=room)
-    surfels = shader.turn_to_camera(surfels, camera)
-    buffer = splatting.blend(found, surfels, shader.attributes(surfels, light, camera), camera, slots=slots)
-    return buffer, lost + jnp.maximum(splatting.count_covered_pixels(found) - slots, 0)
+    entries, overflow = splatting.make_entries(surfels, camera, capacity=capacity)
+    surfels = shader.face_camera(surfels, camera)
+    buffer = splatting.blend(entries, surfels, shader.compute_attributes(surfels, light, camera), camera, slots=slots)
+    return buffer, overflow + jnp.maximum(splatting.count_covered_pixels(entries) - slots, 0)
 
 
 def prepare_inputs(
@@ -264,13 +266,13 @@ def prepare_inputs(
     Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
 ]:
     """Inputs of the network, light maps, spherical harmonics of the light in camera axes, and depth."""
-    told, maps = shader.features(buffer, light, camera)
-    return told, maps, lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
+    inputs, maps = shader.compute_inputs(buffer, light, camera)
+    return inputs, maps, lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
 
 
 def shade(
     params: dict | None,
-    seen: Float[Array, "height width 33"],
+    inputs: Float[Array, "height width 33"],
     maps: Float[Array, "height width 17"],
     ambient: Float[Array, "9 3"],
     depth: Float[Array, "height width"],
@@ -279,17 +281,17 @@ def shade(
 ) -> Float[Array, "h w 5"]:
     """Colour, opacity and depth along the camera's axis in the window, at the doubled resolution."""
     if params is None:
-        outputs = jnp.zeros((1, *(n << doublings for n in seen.shape[:2]), NUM_OUTPUTS))
+        outputs = jnp.zeros((1, *(n << doublings for n in inputs.shape[:2]), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(shader_of(params).apply({"params": params["params"]}, seen[None], doublings))
-    color, alpha = picture(outputs, maps[None], ambient[None], doublings)
+        outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, inputs[None], doublings))
+    color, alpha = compose_picture(outputs, maps[None], ambient[None], doublings)
     depth = depth[None, ..., None]
     for _ in range(doublings):
         depth = double_size(depth)
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 
-def shader_of(params: dict) -> Shader:
+def make_shader(params: dict) -> Shader:
     """The shader network for these weights; its sizes are read from them."""
     weights = params["params"]
     levels = sum(name.startswith("down") for name in weights)
@@ -297,7 +299,7 @@ def shader_of(params: dict) -> Shader:
     return Shader(widths, weights["top"]["kernel"].shape[-1])
 
 
-def paste(
+def paste_window(
     drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
     """Image, depth along rays and opacity of the whole picture: empty outside the window, which may extend beyond."""
@@ -308,7 +310,7 @@ def paste(
     start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
     sums = jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width]
     if side > 1:
-        sums = mean_of_squares(sums, side)
+        sums = average_pool(sums, side)
     acc = sums[..., 3]
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)

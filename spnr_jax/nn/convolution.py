@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import per_feature
 
-FEW_PIXELS = 2  # an axis, for which a kernel is larger than what it is folded for
-MANY_FEATURES = 128  # of its input, for which one matrix product is faster than a convolution
+FEW_PIXELS = 2  # along an axis, up to which folding the kernel takes longer than the convolution
+MANY_FEATURES = 128  # of the input, from which one matrix product is faster than a convolution
 
 kernel_init = jax.nn.initializers.he_normal(in_axis=-2, out_axis=-1)
 
@@ -37,7 +37,7 @@ def conv(
 ) -> Float[Array, "batch *out_space out"]:
     """Convolution (correlation) in 2D or 3D with equal stride and padding on every axis; derivatives of both modes.
 
-    With bf16 the convolution and its gradients run in bfloat16; what goes in and comes out keeps its own format.
+    With bf16, the convolution and its gradients run in bfloat16; inputs and outputs keep their own type.
     """
     result = x.dtype
     if bf16:
@@ -63,17 +63,17 @@ class Conv(nn.Module):
 
 def _native(x, kernel, stride, padding):
     n = x.ndim - 2
-    return _plain(x, kernel, (stride,) * n, [(padding, padding)] * n)
+    return _general_conv(x, kernel, (stride,) * n, [(padding, padding)] * n)
 
 
-def _plain(x, kernel, stride, padding, x_dilation=None, kernel_dilation=None):
+def _general_conv(x, kernel, stride, padding, x_dilation=None, kernel_dilation=None):
     axes = "DHW"[-(x.ndim - 2) :]
     numbering = f"N{axes}C", f"{axes}IO", f"N{axes}C"
     return lax.conv_general_dilated(x, kernel, stride, padding, x_dilation, kernel_dilation, numbering)
 
 
 def _windows(x, window: int, stride: int):
-    """For each place in a window of the trailing spatial axes: what it sees in every window, (batch, *out, in)."""
+    """For each position in a window over the spatial axes: its values in all windows, (batch, *out, in)."""
     stops = [(s - window) // stride * stride + 1 for s in x.shape[1:-1]]
     for place in itertools.product(range(window), repeat=x.ndim - 2):
         corner = (0, *place, 0)
@@ -91,58 +91,58 @@ def _conv2d(x, kernel, stride, padding):
 
 
 def _conv2d_jvp(stride, padding, primals, tangents):
-    """Written as the transposes of the gradients that are fast on a CPU: transposed again they are these gradients."""
+    """The transposes of gradients that are fast on a CPU; reverse mode transposes them again."""
     out = _conv2d(*primals, stride, padding)
-    changes = [
+    tangents_out = [
         jax.linear_transpose(lambda cotangent, of=of: of(*primals, cotangent, stride, padding), out)(tangent)[0]
         for of, tangent in zip((_input_gradient, _kernel_gradient), tangents, strict=True)
         if not isinstance(tangent, SymbolicZero)
     ]
-    return out, sum(changes[1:], changes[0])
+    return out, sum(tangents_out[1:], tangents_out[0])
 
 
 _conv2d.defjvp(_conv2d_jvp, symbolic_zeros=True)
 
 
 def _input_gradient(x, kernel, cotangent, stride, padding):
-    """The convolution of the cotangents with the kernel turned round, input and output features exchanged.
+    """The convolution of the cotangents with the flipped kernel, input and output features exchanged.
 
-    JAX's own gradient is the same sum with the axes in another order.  Of that XLA's CPU compiler makes a fast program
-    outside of loops alone: within one (`lax.scan`, `lax.map`) it took 5 to 29 times as long, that of
-    `_kernel_gradient` 46 to 97.
+    JAX's own gradient is the same sum with the axes in another order.  XLA's CPU compiler makes a fast program of it
+    only outside of loops: within `lax.scan` or `lax.map` it took 5 to 29 times as long, and the kernel's gradient 46 to
+    97 times.
     """
     window = kernel.shape[0]
     first = window - 1 - padding
     last = [n + padding - (m - 1) * stride - 1 for n, m in zip(x.shape[1:3], cotangent.shape[1:3], strict=True)]
-    turned = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
-    return _plain(cotangent, turned, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
+    flipped = jnp.swapaxes(jnp.flip(kernel, (0, 1)), 2, 3)
+    return _general_conv(cotangent, flipped, (1, 1), [(first, n) for n in last], x_dilation=(stride,) * 2)
 
 
 def _kernel_gradient(x, kernel, cotangent, stride, padding):
-    """The convolution of the input, features as pictures, with the cotangents as one large window.
+    """The convolution of the input, with features as the batch, with the cotangents as one large window.
 
-    For other windows than of 3 there is one product per place in them.
+    Windows of other sizes than 3 take one matrix product per position.
     """
     window = kernel.shape[0]
     if window != 3:
         flat = cotangent.reshape(-1, kernel.shape[-1])
-        seen = _windows(_pad(x, padding), window, stride)
-        return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in seen]).reshape(kernel.shape)
+        windows = _windows(_pad(x, padding), window, stride)
+        return jnp.stack([s.reshape(flat.shape[0], -1).T @ flat for s in windows]).reshape(kernel.shape)
     sizes = zip(x.shape[1:3], cotangent.shape[1:3], strict=True)
     pads = [(padding, (m - 1) * stride + window - n - padding) for n, m in sizes]
     large = jnp.transpose(cotangent, (1, 2, 0, 3))
-    dk = _plain(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
+    dk = _general_conv(jnp.transpose(x, (3, 1, 2, 0)), large, (1, 1), pads, kernel_dilation=(stride,) * 2)
     return jnp.transpose(dk, (1, 2, 0, 3))
 
 
 def _conv2d_cpu(x, kernel, stride, padding):
     if kernel.shape[-2] >= MANY_FEATURES:
-        return _columns(x, kernel, stride, padding)
+        return _im2col(x, kernel, stride, padding)
     return _conv2d(x, kernel, stride, padding)
 
 
-def _columns(x, kernel, stride, padding):
-    """One matrix product of everything that each window sees."""
+def _im2col(x, kernel, stride, padding):
+    """One matrix product over all windows (im2col)."""
     columns = jnp.concatenate(list(_windows(_pad(x, padding), kernel.shape[0], stride)), axis=-1)
     return columns @ kernel.reshape(-1, kernel.shape[-1])
 
@@ -150,7 +150,7 @@ def _columns(x, kernel, stride, padding):
 def _conv3d_cpu(x, kernel, stride, padding):
     taps = kernel.shape[0]
     if x.shape[1] <= 4:
-        return _columns(x, kernel, stride, padding)
+        return _im2col(x, kernel, stride, padding)
     x = jnp.pad(x, ((0, 0), (padding, padding), *[(0, 0)] * 3))
     depth = (x.shape[1] - taps) // stride + 1
     slices = (lax.slice_in_dim(x, k, k + (depth - 1) * stride + 1, stride, axis=1) for k in range(taps))
@@ -221,7 +221,7 @@ class BatchNorm(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, shape)
         running_variance = self.variable("batch_stats", "variance", jnp.ones, shape)
         if train:
-            x = jnp.where(mask[..., None], x, 0)  # what fills the padding may be anything
+            x = jnp.where(mask[..., None], x, 0)  # padding may hold any values
             axes = tuple(range(x.ndim - 1))
             weight = mask[..., None].astype(x.dtype)
             count = jnp.maximum(jnp.sum(weight), 1)

@@ -8,7 +8,7 @@ U-Net           each encoder stage (a stride-2 convolution and one at stride 1) 
 field           density and colour at a place from the volume's feature there: one hidden layer with softplus, density =
                 softplus(raw - 1) (a ReLU can die early in training); features depend on the view direction.  All
                 features but RGB are linear in the hidden layer, and so is compositing: the hidden layer is composited,
-                and `finish` applies the linear part once per ray instead of once per sample
+                and `decode` applies the linear part once per ray instead of once per sample
 upsampler       feature image to an image of twice the size; it learns what to add to the bilinear RGB
 discriminator   PatchGAN on image patches and the true colours at the visible input points
 """
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.config import EncoderConfig
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.imaging import WHITE, bilinear, linear_to_srgb
+from spnr_jax.kernels.imaging import WHITE, linear_to_srgb, resize_bilinear
 from spnr_jax.kernels.numerics import per_feature, softplus
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.voxels import scatter_conv
@@ -60,7 +60,7 @@ class PointNet(nn.Module):
     def __call__(
         self, x: Float[Array, "*batch points channels"], mask: Bool[Array, "*batch points"], train: bool
     ) -> Float[Array, "*batch points features"]:
-        """Features of every point; masked points do not touch the statistics of a batch."""
+        """Features of every point; masked points do not affect the statistics of a batch."""
         # one long axis of points: XLA's CPU gradient of a product that sums over several axes takes four times as long
         shape, x, mask = mask.shape, x.reshape(-1, x.shape[-1]), mask.reshape(-1)
         for i, width in enumerate(self.widths):
@@ -69,10 +69,10 @@ class PointNet(nn.Module):
         return nn.Dense(self.num_features, name="out")(x).reshape(*shape, self.num_features)
 
 
-def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
-    """Values around 0 of a material in [0, 1]: of base colours (linear RGB) the sRGB brightness and two axes of hue.
+def whiten_materials(material: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+    """A material in [0, 1], centred at 0; base colours (linear RGB) become sRGB brightness and two axes of hue.
 
-    As they are, hues are a twentieth of what varies between points, and a stem of few channels learns to drop them.
+    Unchanged, hues are a twentieth of the variance between points, and a stem with few channels learns to drop them.
     """
     if material.shape[-1] == 1:
         return 2 * material - 1
@@ -80,7 +80,7 @@ def spread_out(material: Float[Array, "*batch channels"]) -> Float[Array, "*batc
 
 
 class Encoder(nn.Module):
-    """The paper's network begins with it; with bf16 the convolutions of the U-Net run in bfloat16."""
+    """PointNet, scatter and 3D U-Net; with bf16, the convolutions of the U-Net run in bfloat16."""
 
     config: EncoderConfig
     bf16: bool = False
@@ -94,11 +94,11 @@ class Encoder(nn.Module):
     def __call__(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects d d d features"]:
         """Feature volume of each object, (z, y, x)."""
         positions, mask = jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)
-        spread = partial(voxels.spread, resolution=self.config.volume_resolution)
-        return self.unet(*jax.vmap(spread)(positions, self.point_features(cloud, train), mask))
+        contribute = partial(voxels.mean_contributions, resolution=self.config.volume_resolution)
+        return self.unet(*jax.vmap(contribute)(positions, self.point_features(cloud, train), mask))
 
     def point_features(self, cloud: PointCloud, train: bool = False) -> Float[Array, "objects points features"]:
-        """What the PointNet makes of each point."""
+        """Features of each point from the PointNet."""
         return self.pointnet(self.point_inputs(cloud), jnp.asarray(cloud.mask), train)
 
     def point_inputs(self, cloud: PointCloud) -> Float[Array, "objects points channels"]:
@@ -107,7 +107,7 @@ class Encoder(nn.Module):
         materials = [getattr(cloud, name) for name in self.config.materials]
         materials = [m[..., None] if m.ndim < cloud.positions.ndim else m for m in materials]
         if self.config.inputs == "spread":
-            materials = [spread_out(m) for m in materials]
+            materials = [whiten_materials(m) for m in materials]
         inputs = jnp.concatenate([cloud.positions, offset, *materials], axis=-1)
         return jnp.where(cloud.mask[..., None], inputs, 0.0)
 
@@ -164,7 +164,7 @@ class UNet3D(nn.Module):
     def __call__(
         self, rows: Int[Array, "objects points"], values: Float[Array, "objects points channels"]
     ) -> Float[Array, "objects d d d features"]:
-        """Feature volume of each object from its scattered points (`voxels.scatter_conv` says in which form)."""
+        """Feature volume of each object from its scattered points (in the form of `voxels.scatter_conv`)."""
         x = Stem(self.base_width, self.resolution, self.num_groups, name="stem")(rows, values)
         skips, width = [], self.base_width
         for i in range(self.num_stages):
@@ -182,7 +182,7 @@ class UNet3D(nn.Module):
 
 
 class RadianceField(nn.Module):
-    """Density and colour of samples; `view` and `finish` are the parts that a ray needs once."""
+    """Density and colour of samples; `view` and `decode` are the parts that a ray needs once."""
 
     width: int
     num_features: int
@@ -198,7 +198,7 @@ class RadianceField(nn.Module):
         self.feature_bias = self.param("feature_bias", nn.initializers.zeros, (self.num_features - 3,))
 
     def view(self, directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays features"]:
-        """What the view direction adds to each feature: nothing if the field does not see it."""
+        """Contribution of the view direction to each feature; 0 if the field does not see it."""
         if not self.sees_direction:
             return jnp.zeros((*directions.shape[:-1], self.num_features), directions.dtype)
         return self.direction(encode_direction(directions, self.direction_frequencies))
@@ -206,17 +206,17 @@ class RadianceField(nn.Module):
     def __call__(
         self, x: Float[Array, "*rays samples channels"], view: Float[Array, "*rays features"]
     ) -> tuple[Float[Array, "*rays samples"], tuple[Array, Array]]:
-        """Density, and what is emitted at each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
+        """Density, and the emitted values of each sample: RGB in (0, 1) and hidden layer (*rays, samples, ...)."""
         # one long axis of samples: XLA's CPU gradient of a product that sums over several axes takes four times as long
         hidden = softplus(self.hidden(x.reshape(-1, x.shape[-1])))
         out = self.head(hidden).reshape(*x.shape[:-1], 4)
         rgb = nn.sigmoid(out[..., 1:] + view[..., None, :3])
         return softplus(out[..., 0] - 1), (rgb, hidden.reshape(*x.shape[:-1], self.width))
 
-    def finish(
+    def decode(
         self, emitted: tuple[Array, Array], acc: Float[Array, "*rays"], view: Float[Array, "*rays features"]
     ) -> Float[Array, "*rays features"]:
-        """Features of a ray, RGB on white and the rest on zero, from what is composited and its opacity."""
+        """Features of a ray, RGB on white and the rest on zero, from the composited values and the opacity."""
         rgb, hidden = emitted
         rest = self.features(hidden) + acc[..., None] * (per_feature(self.feature_bias, view) + view[..., 3:])
         return jnp.concatenate([rgb + (1 - acc[..., None]) * WHITE, rest], axis=-1)
@@ -244,7 +244,7 @@ class Upsampler(nn.Module):
             y = upsample_conv(y, kernel, self.bf16) if i == 2 else conv(y, kernel, bf16=self.bf16)
             y = y + per_feature(self.param(f"bias_{i}", nn.initializers.zeros, (features,)), y)
             y = y if i == 3 else nn.leaky_relu(y, SLOPE)
-        return y + bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])
+        return y + resize_bilinear(jnp.asarray(x[..., :3]), 2 * x.shape[1], 2 * x.shape[2])
 
 
 # --- discriminator ----------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ class Discriminator(nn.Module):
         condition: Float[Array, "batch height width 3"],
         condition_mask: Bool[Array, "batch height width"],
     ) -> Float[Array, "batch rows columns 1"]:
-        """Logit of each patch: positive for what looks like a reference image."""
+        """Logit of each patch: positive for patches that look like a reference image."""
         x = jnp.concatenate([image, condition, condition_mask[..., None].astype(image.dtype)], axis=-1)
         widths = [self.width * 2**i for i in range(4)]
         for i, features in enumerate([*widths, 1]):

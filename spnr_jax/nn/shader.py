@@ -4,9 +4,9 @@ Its inputs are relative: vectors in the camera's axes, lengths in spacings or pi
 common rotation of object, camera and light, nor on the unit of the cloud.
 
 A U-Net runs on the attributes of the front-most surfels, at the resolution at which points lie two to four pixels
-apart, so that its input looks alike for any number of points.  One block then doubles the resolution, as often as the
-picture needs.  Its outputs are factors of light maps that are linear in the light (`picture`).  The light is no input
-of the network, so a picture is linear in it up to the sRGB curve.
+apart, so its input looks alike for any number of points.  One block then doubles the resolution, as often as the
+picture needs.  Its outputs are factors of light maps (`compose_picture`).  The light is not an input, so a picture is
+linear in it up to the sRGB curve.
 """
 
 import dataclasses
@@ -17,8 +17,17 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.imaging import double_size, linear_to_srgb, mean_of_squares, unfold
-from spnr_jax.kernels.numerics import clamp, columns, larger, normalize, one_minus_exp, root, smaller, with_gradient
+from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
+from spnr_jax.kernels.numerics import (
+    clamp,
+    larger,
+    normalize,
+    one_minus_exp,
+    safe_sqrt,
+    smaller,
+    split_columns,
+    with_gradient,
+)
 from spnr_jax.kernels.records import Camera, GBuffer, Light, Surfels
 from spnr_jax.nn.convolution import Conv
 from spnr_jax.surfels import lighting
@@ -30,76 +39,76 @@ from spnr_jax.surfels.sides import DIRECTIONS
 
 NUM_FEATURES, NUM_MAPS = 33, 17
 ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
-FAINT = 0.02  # opacity from which on a pixel's numbers begin to count
+FAINT = 0.02  # opacity at which a pixel's features have half their value
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
-LEAST = 0.01  # opacity from which on a pixel's depth says something
-HAZE = 0.05  # of the opacity that is left where discs hardly cover a pixel: the network may make it solid
-LEAST_CENTRES = 1e-6  # summed narrow weights from which on the colour to first order counts
-TRUST = 0.25  # most that a colour to first order leaves the blended one
+LEAST = 0.01  # opacity above which a pixel has a relief
+HAZE = 0.05  # share of the opacity kept where discs hardly cover a pixel: the network may raise it
+LEAST_SHARP = 1e-6  # summed narrow weights at which the sharp colour has half the confidence
+SHARPEST = 0.25  # largest difference between the sharp colour and the blended one
 
 
-def turn_to_camera(surfels: Surfels, camera: Camera) -> Surfels:
-    """The surfels as seen from a camera: all normals point to it, of what is seen from behind too."""
+def face_camera(surfels: Surfels, camera: Camera) -> Surfels:
+    """The surfels with all normals turned to the camera."""
     view = camera.cam_to_world[:, 3][None] - surfels.position
     behind = jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0
     return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
-def attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 19"]:
-    """Numbers of each surfel that are blended over pixels; those of the light are linear in it."""
+def compute_attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 19"]:
+    """Attributes of each surfel that are blended over pixels; those of the light are linear in it."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
-    openness = jnp.sum(surfels.visible * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
-    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visible, DIRECTIONS, precision="highest")
+    openness = jnp.sum(surfels.visibility * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
+    bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visibility, DIRECTIONS, precision="highest")
     view = normalize(jnp.asarray(eye[None] - surfels.position))
     along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
     mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
     lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
-    reflected = jnp.sum(surfels.visible * lobe, axis=1) / jnp.sum(lobe, axis=1)
-    parts = [surfels.roughness, surfels.metallic, lighting.arriving(surfels, light), reflected, openness]
-    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape]
-    parts += [surfels.sided, surfels.guessed, surfels.invented, jnp.mean(surfels.base_color, axis=1) ** 2]
+    reflected = jnp.sum(surfels.visibility * lobe, axis=1) / jnp.sum(lobe, axis=1)
+    parts = [surfels.roughness, surfels.metallic, lighting.gather_irradiance(surfels, light), reflected, openness]
+    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape_ratios]
+    parts += [surfels.one_sided, surfels.materials_unknown, surfels.learned, jnp.mean(surfels.base_color, axis=1) ** 2]
     return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
 
 
-def features(
+def compute_inputs(
     buffer: GBuffer, light: Light, camera: Camera
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
-    """The network's input, which knows no light, and the maps of materials and light for `nn.shader.picture`."""
+    """The network's inputs, which do not depend on the light, and material and light maps for `compose_picture`."""
     first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
-    (roughness, metallic, *arriving, reflected, openness), of_surface = map(columns, (first, last))
-    planarity, linearity, sided, guessed, invented, squared = of_surface
-    told = (buffer.centres / (buffer.centres + LEAST_CENTRES))[..., None]  # without discs near by the blended one
-    color = clamp(blended + told * clamp(buffer.color - blended, -TRUST, TRUST), 0, 1)
+    (roughness, metallic, *arriving, reflected, openness), of_surface = map(split_columns, (first, last))
+    planarity, linearity, one_sided, materials_unknown, learned, squared = of_surface
+    confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
+    color = clamp(blended + confidence * clamp(buffer.color - blended, -SHARPEST, SHARPEST), 0, 1)
     normal, view = _directions(buffer, camera)
     cosine = -reduce(add, (n * v for n, v in zip(normal, view, strict=True)))
     mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
-    turned = [_to_world(camera, direction) for direction in (normal, mirror)]
+    world = [_to_world(camera, direction) for direction in (normal, mirror)]
     factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
     numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
-    numbers += [smaller(buffer.spread / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
-    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, sided, cosine]
+    numbers += [smaller(buffer.depth_deviation / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
+    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, one_sided, cosine]
     vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
     drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
-    pattern = [jnp.log1p(8 * buffer.centres)[..., None], clamp(buffer.beside / in_pixels[..., None], -2, 2)]
-    seen = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
+    pattern = [jnp.log1p(8 * buffer.sharp_weight)[..., None], clamp(buffer.centre_offset / in_pixels[..., None], -2, 2)]
+    inputs = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
     covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
-    contrast = root(squared - jnp.mean(blended, axis=-1) ** 2)  # of the colours that are blended: a texture
-    pattern += [guessed[..., None], invented[..., None], contrast[..., None]]
-    seen = jnp.concatenate([drawn * seen, drawn, *(drawn * x for x in pattern)], axis=-1)
-    unshadowed = lighting.irradiance(light, turned[0]), lighting.reflect(light, turned[1], roughness)
-    maps = [*columns(color), metallic, covered, factor, summand, *arriving]
-    return seen, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
+    contrast = safe_sqrt(squared - jnp.mean(blended, axis=-1) ** 2)  # standard deviation of the blended colours
+    pattern += [materials_unknown[..., None], learned[..., None], contrast[..., None]]
+    inputs = jnp.concatenate([drawn * inputs, drawn, *(drawn * x for x in pattern)], axis=-1)
+    unshadowed = lighting.irradiance(light, world[0]), lighting.reflect(light, world[1], roughness)
+    maps = [*split_columns(color), metallic, covered, factor, summand, *arriving]
+    return inputs, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
     """Unit normals and rays' directions, camera axes, as columns; the camera's axis where there is no normal."""
-    size = root(jnp.sum(buffer.normal**2, axis=-1))
+    size = safe_sqrt(jnp.sum(buffer.normal**2, axis=-1))
     known = size > 1e-3
-    normal = [n / larger(size, 1e-4) for n in columns(buffer.normal)]
+    normal = [n / larger(size, 1e-4) for n in split_columns(buffer.normal)]
     normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
     across, down = jnp.arange(camera.width) + 0.5, jnp.arange(camera.height) + 0.5
     right = jnp.broadcast_to(((across - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])[None], size.shape)
@@ -115,7 +124,7 @@ def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
 
 
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
-    """How far each pixel lies behind the mean around it, in spacings, squeezed into (-1, 1)."""
+    """Depth of each pixel behind the mean around it, in spacings, mapped to (-1, 1)."""
     mean = _box(buffer.opacity * buffer.depth, reach) / larger(_box(buffer.opacity, reach), 1e-3)
     return jnp.where(buffer.opacity > LEAST, jnp.tanh((buffer.depth - mean) / (4 * spacing)), 0)
 
@@ -128,7 +137,7 @@ def _plain_box(values: Float[Array, "height width"], reach: int) -> Float[Array,
 
 
 def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
-    """Sums over squares of pixels; there is nothing beyond the picture.  It is its own transpose."""
+    """Sums over squares of pixels, 0 beyond the picture; its own transpose."""
     plain = partial(_plain_box, reach=reach)
     summed = with_gradient(lambda x: (plain(x),), lambda primals, given: (plain(*given),))
     return summed(values)[0]
@@ -138,9 +147,9 @@ def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "heig
 
 
 NUM_OUTPUTS = 21
-COLOR_STEP, ODDS_STEP = 0.3, 2.0  # what an output of 1 changes the base colour, and the log odds of the opacity by
-LEAST_ODDS = 1e-2  # keeps the odds of what is clear or opaque finite
-NOTHING = 2e-4  # opacity below which a pixel stays clear, whatever the network says
+COLOR_STEP, LOGIT_STEP = 0.3, 2.0  # change of the base colour, and of the opacity's logit, by an output of 1
+LOGIT_MARGIN = 1e-2  # keeps the logits of 0 and 1 finite
+NOTHING = 2e-4  # opacity below which a pixel stays transparent
 
 
 class Block(nn.Module):
@@ -161,28 +170,28 @@ class Double(nn.Module):
     def __call__(self, x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
         """Bilinear, plus four new pixels from each, plus two convolutions."""
         features = x.shape[-1]
-        x = double_size(x) + unfold(nn.Dense(4 * features, name="expand")(x), 2)
+        x = double_size(x) + depth_to_space(nn.Dense(4 * features, name="expand")(x), 2)
         y = nn.relu(Conv(features, name="a")(x))
         return x + Conv(features, name="b")(y)
 
 
 class Shader(nn.Module):
-    """Factors of a picture's light maps (`picture`) from a G-buffer (`surfels.features`)."""
+    """Factors of a picture's light maps (`compose_picture`) from a G-buffer (`compute_inputs`)."""
 
     widths: tuple[int, ...]
     top: int
 
     @nn.compact
     def __call__(
-        self, seen: Float[Array, "batch height width features"], doublings: int, margin: int = 0
+        self, inputs: Float[Array, "batch height width features"], doublings: int, margin: int = 0
     ) -> Float[Array, "batch h w 21"]:
-        """Outputs at 2^doublings times the resolution, but for a margin of pixels that only tell what is around."""
-        height, width = seen.shape[1:3]
+        """Outputs at 2^doublings times the resolution, without a margin of pixels that is only context."""
+        height, width = inputs.shape[1:3]
         square = 2 ** (len(self.widths) - 1)
-        x = jnp.pad(seen, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
+        x = jnp.pad(inputs, ((0, 0), (0, -height % square), (0, -width % square), (0, 0)))
         skips = []
         for level, features in enumerate(self.widths):
-            x = Conv(features, name=f"in{level}")(mean_of_squares(x, 2) if level else x)
+            x = Conv(features, name=f"in{level}")(average_pool(x, 2) if level else x)
             x = Block(name=f"down{level}")(x)
             skips.append(x)
         for level in reversed(range(len(self.widths) - 1)):
@@ -195,35 +204,35 @@ class Shader(nn.Module):
         return nn.Dense(NUM_OUTPUTS, kernel_init=nn.initializers.zeros, name="out")(nn.LayerNorm(name="norm")(x))
 
 
-def log_odds(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
-    """Finite ones, also of 0 and 1."""
-    return jnp.log(opacity + LEAST_ODDS) - jnp.log(1 + LEAST_ODDS - opacity)
+def logit(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
+    """Logits of opacities; finite also for 0 and 1."""
+    return jnp.log(opacity + LOGIT_MARGIN) - jnp.log(1 + LOGIT_MARGIN - opacity)
 
 
-def picture(
+def compose_picture(
     outputs: Float[Array, "batch h w 21"],
     maps: Float[Array, "batch height width 17"],
     ambient: Float[Array, "batch 9 3"],
     doublings: int,
 ) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
-    """sRGB colour and opacity: light that the network lets through falls on the surfels' materials.
+    """sRGB colour and opacity: materials lit by the light maps, times the factors of the network.
 
-    `maps` are those of `surfels.features`, `ambient` the light's spherical harmonics in camera axes.
+    `maps` are those of `compute_inputs`, `ambient` the light's spherical harmonics in camera axes.
     """
     for _ in range(doublings):
         maps = double_size(maps)
     color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected = jnp.split(
         maps, (3, 4, 5, 6, 7, 10, 13, 16), axis=-1
     )
-    step, odds_step, shade, open_sky, shine, glow, bounce, bounces, metal_step, rougher = jnp.split(
+    step, logit_step, shade, open_sky, shine, glow, bounce, bounces, metal_step, rougher = jnp.split(
         outputs, (3, 4, 5, 6, 7, 8, 11, 19, 20), axis=-1
     )
     base = clamp(color + COLOR_STEP * step, 0, 1)
-    alpha = nn.sigmoid(log_odds(opacity) + ODDS_STEP * odds_step) * one_minus_exp(opacity / NOTHING)
+    alpha = nn.sigmoid(logit(opacity) + LOGIT_STEP * logit_step) * one_minus_exp(opacity / NOTHING)
     bounced = bounce * ambient[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", bounces, ambient[:, 1:], precision="highest")
     metallic = clamp(metallic + COLOR_STEP * metal_step, 0, 1)
-    mirrored += clamp(rougher, 0, 1) * (unshadowed - mirrored)  # rougher than it is said to be
+    mirrored += clamp(rougher, 0, 1) * (unshadowed - mirrored)
     diffuse = (1 + shade) * arriving + open_sky * unshadowed + bounced
     specular = (1 + shine) * reflected + glow
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic

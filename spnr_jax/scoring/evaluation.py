@@ -1,4 +1,4 @@
-"""How good methods are on a split of a data set: a network beside the trivial renderers that every table shows.
+"""Scores of methods on a split of a data set: a network beside the trivial renderers that every table shows.
 
 A method is a function that shows a cloud to cameras (`Method`); all of them see the same points and cameras, and are
 scored by the same metrics.
@@ -43,7 +43,7 @@ BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per vi
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """What a method shows of one object: image (views, height, width, 3), opacity and depth (views, h, w).
+    """Renderings of one object by a method: image (views, height, width, 3), opacity and depth (views, h, w).
 
     Opacity and depth may be smaller than the image; the trivial renderers have no depth.
     """
@@ -74,7 +74,7 @@ def _score(
     alpha: Array,
     mask: Array,
 ) -> dict[str, Array]:
-    """The metrics of JAX of one object's views."""
+    """Metrics of one object's views that are computed by JAX."""
     return {
         "psnr": metrics.psnr(image, reference),
         "ssim": metrics.ssim(image, reference),
@@ -86,14 +86,14 @@ def _score(
 def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float) -> tuple[Array, Array]:
     """Image and opacity of a trivial renderer for all views of one cloud."""
     if method == "white":
-        image = white(camera)
+        image = render_white(camera)
         return image, jnp.zeros(image.shape[:-1])
-    return _draw_floor(cloud, camera, jnp.float32(factor * spacing(cloud)), method=method)
+    return _draw_floor(cloud, camera, jnp.float32(factor * measure_nearest_distance(cloud)), method=method)
 
 
 @partial(jax.jit, static_argnames="method")
 def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
-    draw = {"splat": splat, "nearest": nearest}[method]
+    draw = {"splat": render_splat, "nearest": render_nearest}[method]
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
@@ -113,8 +113,8 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
     return max(RADIUS_FACTORS, key=mean_psnr)
 
 
-def network(variables: dict, config: TrainConfig) -> Method:
-    """The method of a trained network; one that uses normals has to estimate them, because the others see none."""
+def make_method(variables: dict, config: TrainConfig) -> Method:
+    """The method of a trained network; normals are removed from the clouds, because other methods get none."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
         cloud = dataclasses.replace(cloud, normals=None)
@@ -124,7 +124,7 @@ def network(variables: dict, config: TrainConfig) -> Method:
     return show
 
 
-def floor(name: str, factor: float = 1.0) -> Method:
+def make_floor(name: str, factor: float = 1.0) -> Method:
     """The method of a trivial renderer."""
 
     def show(cloud: PointCloud, camera: Camera) -> Pictures:
@@ -146,7 +146,7 @@ def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_
     for method, show in methods.items():
         shown = show(cloud, item.camera)
         scores[method] = score_pictures(item, shown)
-        pictures[method] = on_host(shown)
+        pictures[method] = to_numpy(shown)
     return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
 
 
@@ -160,7 +160,7 @@ def score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
     return scores if distance is None else scores | {"lpips": distance}
 
 
-def on_host(pictures: Pictures) -> Pictures:
+def to_numpy(pictures: Pictures) -> Pictures:
     """The pictures as NumPy arrays, the image in [0, 1]."""
     depth = None if pictures.depth is None else np.asarray(pictures.depth)
     return Pictures(image=np.clip(np.asarray(pictures.image), 0, 1), acc=np.asarray(pictures.acc), depth=depth)
@@ -168,20 +168,20 @@ def on_host(pictures: Pictures) -> Pictures:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What `spnr evaluate` writes: the metrics.json content, and results of the objects for the gallery."""
+    """The output of `spnr evaluate`: content of metrics.json, and results of the objects in the gallery."""
 
     config: TrainConfig
     summary: dict
     gallery: list[ObjectResult]
 
 
-def spread(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """So many of the names, evenly from the first to the last."""
+def pick_evenly(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """`count` of the names, evenly spaced from the first to the last."""
     return tuple(names[round(i)] for i in np.linspace(0, len(names) - 1, min(count, len(names))))
 
 
 def median_view(psnr: np.ndarray) -> int:
-    """The view with the median PSNR, which neither flatters nor slanders."""
+    """The view with the median PSNR, as the most typical one."""
     return int(np.argsort(psnr)[len(psnr) // 2])
 
 
@@ -193,10 +193,10 @@ def score_methods(
     gallery_objects: int,
     say: Callable[[str], None],
 ) -> tuple[dict[str, dict[str, Scores]], list[ObjectResult]]:
-    """Scores of every object by name, and the results of a few objects, spread over the names, to be looked at."""
+    """Scores of every object by name, and the results of a few objects for the gallery."""
     scores: dict[str, dict[str, Scores]] = {}
     gallery = []
-    shown = spread(names, gallery_objects)
+    shown = pick_evenly(names, gallery_objects)
     for i, name in enumerate(names):
         result = evaluate_object(methods, config, data_sets.read_object(dataset, name))
         scores[name] = result.scores
@@ -214,7 +214,7 @@ def evaluate(
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
 ) -> Evaluation:
-    """Scores of a run's newest checkpoint on a split, named by what it is."""
+    """Scores of a run's newest checkpoint on a split, under the name of its method."""
     trained = read_trained(run, say)
     return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say)
 
@@ -226,7 +226,7 @@ def compare(
     gallery_objects: int = 16,
     say: Callable[[str], None] = print,
 ) -> Evaluation:
-    """Scores of networks on a split, all with the points of the first, which the others are subtracted from."""
+    """Scores of networks on a split, all with the same points; differences are the first minus each other."""
     first = next(iter(trained))
     config = trained[first].config
     names = dataset.splits[split]
@@ -237,8 +237,8 @@ def compare(
             "or generate the data set anew with --test-objects N"
         )
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
-    methods = {name: network(one.variables, one.config) for name, one in trained.items()}
-    methods |= {name: floor(name, factors.get(name, 1.0)) for name in FLOORS}
+    methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
+    methods |= {name: make_floor(name, factors.get(name, 1.0)) for name in FLOORS}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say)
     summary = {
         "methods": summarise(list(scores.values())),
@@ -246,7 +246,7 @@ def compare(
         "preset": config.preset,
         "steps": trained[first].steps,
         "seed": config.seed,
-        "hardware": runtime.hardware(),
+        "hardware": runtime.describe_hardware(),
         "settings": {
             "split": split,
             "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
@@ -261,12 +261,12 @@ def compare(
 # --- the trivial renderers --------------------------------------------------------------------------------------------
 
 
-def white(camera: Camera) -> Float[Array, "*batch height width 3"]:
+def render_white(camera: Camera) -> Float[Array, "*batch height width 3"]:
     """The white image."""
     return jnp.ones((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3))
 
 
-def splat(
+def render_splat(
     cloud: PointCloud, camera: Camera, radius: Float[Array, ""] | float
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
     """sRGB image and opacity (0 or 1) of discs around the points; the disc nearest in camera depth wins."""
@@ -283,7 +283,7 @@ def splat(
     return _shade_first(cloud, camera, order)
 
 
-def nearest(
+def render_nearest(
     cloud: PointCloud, camera: Camera, radius: Float[Array, ""] | float
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"]]:
     """sRGB image and opacity (0 or 1) of the union of balls around the points, coloured by the nearest point.
@@ -305,14 +305,14 @@ def nearest(
     return _shade_first(cloud, camera, order)
 
 
-def spacing(cloud: PointCloud) -> float:
+def measure_nearest_distance(cloud: PointCloud) -> float:
     """Median distance of a real point to its nearest other, in world units; 0 for fewer than two points."""
     real = np.asarray(cloud.positions)[np.asarray(cloud.mask)]
     return float(np.median(cKDTree(real).query(real, 2)[0][:, 1])) if len(real) > 1 else 0.0
 
 
 def _shade_first(cloud, camera, order):
-    """Image and opacity where each ray shows the point that `order`(direction) puts first; infinity is a miss."""
+    """Image and opacity; each ray shows the point with the least `order`(direction); infinity is a miss."""
     directions = camera_rays(camera).directions.reshape(-1, 3)
 
     def first(direction):
@@ -327,5 +327,5 @@ def _shade_first(cloud, camera, order):
 
 
 def _map_blocks(function, inputs, num_points):
-    """`function` of every row of `inputs`, so many rows at once that BLOCK pairs of row and point are in memory."""
+    """`function` of every row of `inputs`; as many rows at once as give BLOCK pairs of row and point."""
     return jax.lax.map(function, inputs, batch_size=max(1, BLOCK // num_points))

@@ -1,10 +1,9 @@
-"""Scores of pictures, and what scores of many objects say: means with intervals, differences on the same objects.
+"""Scores of pictures, and statistics over objects: means with intervals, paired differences.
 
 Pictures are sRGB in [0, 1] on white, (*batch, height, width, 3); lengths are pixels.  FLIP (Andersson et al. 2020, low
 dynamic range) compares what the eye resolves at PIXELS_PER_DEGREE, by the package `flip-evaluator`.  LPIPS (Zhang et
 al. 2018, version 0.1, AlexNet) compares features of a trained network; it is measured where the package `lpips` is
-installed and finds its weights.  Both are 0 for the same picture.  The others take references as RGBA with straight
-alpha, float in [0, 1].
+installed and finds its weights.  Both are 0 for the same picture.
 
 Scores come by object, an array (views,) each; NaN is a view without a score and is left out, None stands where there is
 no number.  Views of one object are not independent, so objects are drawn, each with all its views, and the interval is
@@ -17,12 +16,11 @@ over objects.  Objects are sorted before anything is drawn: their order does not
 import importlib
 from collections.abc import Iterable, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from flip_evaluator import evaluate
 from jaxtyping import Float, Int
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
 
 from spnr_jax.kernels.records import AnyArray
 
@@ -36,8 +34,8 @@ def flip(
 ) -> Float[np.ndarray, "*batch"]:
     """Mean of FLIP's error map."""
     pairs = zip(_views(reference), _views(image), strict=True)
-    asked = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
-    means = [evaluate(wanted, shown, "LDR", **asked)[0].mean(dtype=np.float64) for wanted, shown in pairs]
+    options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
+    means = [evaluate(wanted, shown, "LDR", **options)[0].mean(dtype=np.float64) for wanted, shown in pairs]
     return np.array(means).reshape(np.shape(image)[:-3])
 
 
@@ -78,7 +76,7 @@ Scores = dict[str, np.ndarray]  # metric -> score of each view (views,); cpsnr i
 
 
 def metric_settings() -> dict[str, str]:
-    """What stands beside every table: how its numbers were measured."""
+    """How the metrics were measured; shown beside every table."""
     return {
         "images": "sRGB in [0, 1] over white; means over images",
         "PSNR": "at most 100 dB; cPSNR over the pixels of visible input points, images without any left out",
@@ -176,63 +174,3 @@ def _by_object(scores: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, " object
     pairs = sorted((float(np.nansum(x, dtype=np.float64)), int(np.sum(~np.isnan(x)))) for x in scores)
     sums, counts = (np.array(column) for column in zip(*pairs, strict=True))
     return sums[counts > 0], counts[counts > 0]
-
-
-# --- sharpness --------------------------------------------------------------------------------------------------------
-
-
-OUTLINE = 3  # pixels to both sides of the true outline
-WELL_INSIDE = 4  # pixels from the outline
-SOLID = 0.9  # opacity below which a pixel well inside is a hole
-DETAIL = 3.0  # standard deviation of the Gaussian whose residue is detail
-
-
-class Sharpness(NamedTuple):
-    """Of one picture: decibels, a root mean square, per cent, a correlation."""
-
-    psnr: float
-    psnr_inside: float
-    outline_rmse: float
-    holes: float
-    detail: float
-
-
-def sharpness(
-    image: Float[np.ndarray, "height width 3"],
-    opacity: Float[np.ndarray, "height width"],
-    reference: Float[np.ndarray, "height width 4"],
-) -> Sharpness:
-    """The scores of a picture; NaN where the reference has no pixel that a score is of."""
-    alpha = reference[..., 3]
-    white = reference[..., :3] * alpha[..., None] + 1 - alpha[..., None]
-    squared, body = (image - white) ** 2, alpha > 0.5
-    outline = binary_dilation(body, iterations=OUTLINE) & ~binary_erosion(body, iterations=OUTLINE)
-    deep = binary_erosion(body, iterations=WELL_INSIDE)
-    return Sharpness(
-        psnr=_decibels(squared),
-        psnr_inside=_decibels(squared[alpha > 0.999]),
-        outline_rmse=_mean((opacity - alpha)[outline] ** 2) ** 0.5,
-        holes=100 * _mean(opacity[deep] < SOLID),
-        detail=_correlation(_residue(image, DETAIL)[deep], _residue(white, DETAIL)[deep]),
-    )
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(np.mean(values)) if values.size else float("nan")
-
-
-def _decibels(squared: np.ndarray) -> float:
-    mean = _mean(squared)
-    return float(min(-10 * np.log10(mean), 100.0)) if mean > 0 else (100.0 if mean == 0 else mean)
-
-
-def _residue(image: np.ndarray, sigma: float) -> np.ndarray:
-    """What a Gaussian takes away of the mean of the colours."""
-    grey = image.mean(axis=-1)
-    return grey - gaussian_filter(grey, sigma)
-
-
-def _correlation(one: np.ndarray, other: np.ndarray) -> float:
-    if one.size < 2 or one.std() == 0 or other.std() == 0:
-        return float("nan")
-    return float(np.corrcoef(one, other)[0, 1])

@@ -16,16 +16,16 @@ import numpy as np
 from spnr_jax.formats.images import depth_image, png_url, template, write_whole
 from spnr_jax.methods import label_of, to_dict
 from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
-from spnr_jax.scoring.picture_scores import NO_LPIPS, interval
+from spnr_jax.scoring.picture_scores import NO_LPIPS
 
-OTHERS = {  # what is shown beside the methods that are trained -> its name in tables and pictures
+OTHERS = {  # methods that are not trained -> name in tables and pictures
     "ours": "Ours",
     "nearest": "Nearest-point shading",
     "splat": "Base-colour splat",
     "white": "White image",
 }
-HIGHER, LOWER = 1, -1  # what is better
-QUALITY = {  # metric -> head of its column, decimals, what is better
+HIGHER, LOWER = 1, -1  # which values are better
+QUALITY = {  # metric -> head of its column, decimals, which values are better
     "psnr": ("PSNR, dB", 2, HIGHER),
     "ssim": ("SSIM", 3, HIGHER),
     "cpsnr": ("cPSNR, dB", 2, HIGHER),
@@ -34,11 +34,11 @@ QUALITY = {  # metric -> head of its column, decimals, what is better
     "iou": ("Opacity IoU", 3, HIGHER),
 }
 ARROWS = {HIGHER: "\N{UPWARDS ARROW}", LOWER: "\N{DOWNWARDS ARROW}"}
-MISSING = {"lpips": NO_LPIPS, "iou": "n/a (no opacity)"}  # metric -> what stands where there is no number
+MISSING = {"lpips": NO_LPIPS, "iou": "n/a (no opacity)"}  # metric -> text for a missing number
 
 
 class Cell(NamedTuple):
-    """A text, smaller ones behind it, and whether it is to stand out."""
+    """A text, smaller texts after it, and whether it is highlighted."""
 
     text: str
     small: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class Cell(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Heads (with units), rows of a name and cells, and a line that says how to read them."""
+    """Heads (with units), rows of a name and cells, and an explanatory note."""
 
     title: str
     heads: tuple[str, ...]
@@ -55,7 +55,7 @@ class Table(NamedTuple):
 
 
 def text(value: object) -> Cell:
-    """A cell that is no measurement."""
+    """A cell without a measurement."""
     return Cell(str(value))
 
 
@@ -70,24 +70,12 @@ def number(
     best: bool = False,
     more: tuple[str, ...] = (),
 ) -> Cell:
-    """A number (times a factor) and its interval; `sign` is "+" for differences, `more` stands behind the interval."""
+    """A number (times a factor) and its interval; `sign` is "+" for differences, `more` follows the interval."""
     if value is None or not math.isfinite(value):
         return Cell(missing)
     form = f"{sign},.{decimals}f"
     ends = [f"[{', '.join(f'{factor * end:{form}}' for end in interval)}]"] if interval else []
     return Cell(f"{factor * value:{form}}", (*ends, *more), best)
-
-
-def mean_row(
-    label: str, objects: Sequence[Sequence[Any]] | np.ndarray, decimals: Sequence[int], sign: str = ""
-) -> tuple[str, tuple[Cell, ...]]:
-    """A row of means of columns over objects, with intervals; None and NaN are left out."""
-    cells = []
-    for column, digits in zip(np.array(objects, float).T, decimals, strict=True):
-        known = column[~np.isnan(column)]
-        mean = float(known.mean()) if len(known) else None
-        cells.append(number(mean, digits, interval([np.array([x]) for x in known]) if len(known) else None, sign=sign))
-    return label, tuple(cells)
 
 
 def head(metric: str) -> str:
@@ -121,7 +109,7 @@ def difference(found: Mapping | None, metric: str) -> Cell:
 
 
 def label(method: str) -> str:
-    """What tables and pictures call a method."""
+    """Name of a method in tables and pictures."""
     return OTHERS.get(method) or label_of(method)
 
 
@@ -181,12 +169,12 @@ def write_report(path: Path, settings: Mapping, metrics: Mapping, gallery: Seque
 
 
 def describe_split(metrics: Mapping) -> str:
-    """Which objects are scored."""
+    """The scored objects, in words."""
     return f"objects of the {metrics['settings']['split']} split"
 
 
 def _summary(metrics: Mapping) -> str:
-    """What the first network is, and how many dB it is above the trivial renderers."""
+    """Summary of the first network, and its lead in dB over the trivial renderers."""
     methods, settings = metrics["methods"], metrics["settings"]
     network, row = next(iter(methods.items()))
     best = max((name for name in FLOORS if name in methods), key=lambda name: methods[name]["psnr"])
@@ -205,7 +193,7 @@ def _summary(metrics: Mapping) -> str:
 
 
 def text_table(methods: Mapping[str, Mapping]) -> list[str]:
-    """Lines of the table of methods for a terminal: means, and what could not be measured."""
+    """Lines of the table of methods for a terminal."""
     lines = []
     for method, row in methods.items():
         texts = [
@@ -234,7 +222,7 @@ def duration(seconds: float | int) -> str:
 
 
 def _shown(result: ObjectResult) -> dict[str, Pictures]:
-    """The pictures of the gallery: of all methods but the white image, the networks first."""
+    """Pictures of the gallery: all methods except the white image, networks first."""
     return {method: pictures for method, pictures in result.pictures.items() if method != "white"}
 
 
@@ -273,6 +261,6 @@ def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
 
 
 def _run_facts(metrics: Mapping) -> dict[str, object]:
-    """What made the scores, and how long that took; the rest of metrics.json has tables of its own."""
+    """Facts about the run, such as durations; the rest of metrics.json has its own tables."""
     tables = ("methods", f"{next(iter(metrics['methods']))}_minus", "settings")
     return flatten({name: value for name, value in metrics.items() if name not in tables})

@@ -1,7 +1,7 @@
-"""Extent and colors of discs: spacing, rim of the layer, sharp edges, gaps between random points, borders of color.
+"""Extent and colors of discs: spacing, rim of the layer, sharp edges, gaps between random points, color edges.
 
-Pure functions of a block of points, which is the last axis.  `layer` (k, block) weighs the neighbors by whether they
-lie on the same layer; `place` (k, 2, block) holds the neighbors' coordinates in the tangent plane.  Lengths are in
+Pure functions of a block of points, which is the last axis.  `membership` (k, block) weighs the neighbors by whether
+they lie on the same layer; `uv` (k, 2, block) are the neighbors' coordinates in the tangent plane.  Lengths are in
 spacings unless stated otherwise.
 """
 
@@ -17,90 +17,90 @@ from spnr_jax.kernels.numerics import (
     dot,
     larger,
     largest,
-    root,
+    safe_sqrt,
     smaller,
     smallest,
     solve,
+    sum_first,
     sum_products,
-    total,
     unit,
 )
-from spnr_jax.surfels.layers import Hood, Rules, along
+from spnr_jax.surfels.layers import Constants, Neighborhood, project_on
 
-RIM_DIRECTIONS = 16  # in which the rim of a layer is searched
-CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # columns of a border's sums: moments of the colors
-TURN = 2 * np.pi / RIM_DIRECTIONS * np.arange(RIM_DIRECTIONS)
+NUM_RIM_DIRECTIONS = 16  # in which the rim of a layer is searched
+CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # columns of a color edge's sums: moments of the colors
+RIM_ANGLES = 2 * np.pi / NUM_RIM_DIRECTIONS * np.arange(NUM_RIM_DIRECTIONS)
 
 
-def first_spacing(hood: Hood, rules: Rules) -> Float[Array, " block"]:
-    """Spacing from the area of the disc that holds a number of neighbors on any layer; in units of the box."""
-    count = jnp.minimum(rules.first_disc, jnp.sum(hood.real, axis=0) - 1)
+def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " block"]:
+    """Raw spacing: from the area of the disc that holds 6 neighbors on any layer; in units of the box."""
+    count = jnp.minimum(const.raw_neighbors, jnp.sum(hood.real, axis=0) - 1)
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
-    distance = root(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
+    distance = safe_sqrt(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
     several = count > 0  # a single point represents a tenth of the box
-    spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, rules.least_spacing)
-    return jnp.where(several, spacing, rules.alone)
+    spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, const.least_spacing)
+    return jnp.where(several, spacing, const.single_spacing)
 
 
-def own_spacing(
-    hood: Hood, layer: Float[Array, "k block"], raw: Float[Array, " block"], rules: Rules
+def measure_layer_spacing(
+    hood: Neighborhood, membership: Float[Array, "k block"], raw: Float[Array, " block"], const: Constants
 ) -> Float[Array, " block"]:
-    """Spacing from the area of the disc that holds a number of neighbors on the same layer; in units of the box."""
-    others = len(layer) - 1
-    held = jnp.matmul(jnp.tril(jnp.ones((others, others), layer.dtype)), layer[1:], precision="highest")
-    wanted = jnp.minimum(rules.own_disc, jnp.maximum(rules.own_share * held[-1], 0.5))
+    """Spacing from the area of the disc that holds 5.5 neighbors (by weight) on the same layer; in units of the box."""
+    others = len(membership) - 1
+    summed = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
+    wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * summed[-1], 0.5))
     count = jnp.sum(hood.real, axis=0) - 1
-    last = jnp.minimum(total((held < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
+    last = jnp.minimum(sum_first((summed < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
     chosen = jnp.arange(others, dtype=count.dtype)[:, None] == last[None]
-    weight, squared = total(jnp.where(chosen, held, 0)), total(jnp.where(chosen, hood.squared[1:], 0))
-    spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * root(squared)
-    low, high = rules.bounds
+    weight, squared = sum_first(jnp.where(chosen, summed, 0)), sum_first(jnp.where(chosen, hood.squared[1:], 0))
+    spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * safe_sqrt(squared)
+    low, high = const.spacing_bounds
     return jnp.where(count > 0, clamp(spacing, low * raw, high * raw), raw)
 
 
 def smooth_spacing(
-    layer: Float[Array, "k block"], spacings: Float[Array, "k block"], rules: Rules
+    membership: Float[Array, "k block"], spacings: Float[Array, "k block"], const: Constants
 ) -> Float[Array, " block"]:
-    """Geometric mean of the spacing over the nearest neighbors on the same layer."""
-    weight, near = layer[: rules.smoothed], spacings[: rules.smoothed]
-    return jnp.exp(total(weight * jnp.log(larger(near, rules.least_spacing))) / total(weight))
+    """Geometric mean of the spacing over the 9 nearest neighbors on the same layer."""
+    weight, near = membership[: const.averaged_neighbors], spacings[: const.averaged_neighbors]
+    return jnp.exp(sum_first(weight * jnp.log(larger(near, const.least_spacing))) / sum_first(weight))
 
 
-def average(
-    number: Int[Array, "k block"], weight: Float[Array, "k block"], seen: Float[Array, "all 64"]
+def average_rows(
+    neighbors: Int[Array, "k block"], weight: Float[Array, "k block"], visibility: Float[Array, "all 64"]
 ) -> Float[Array, "block 64"]:
-    """Weighted means of the neighbors' rows of `seen`."""
+    """Weighted means of the neighbors' rows of `visibility`."""
 
     def add(sums: Array, neighbor: tuple[Array, Array]) -> tuple[Array, None]:
-        rows = seen.at[jnp.maximum(neighbor[0], 0)].get(mode="clip")
+        rows = visibility.at[jnp.maximum(neighbor[0], 0)].get(mode="clip")
         return sums + neighbor[1][:, None] * rows, None
 
-    empty = jnp.zeros((weight.shape[1], seen.shape[1]), weight.dtype)
-    return jax.lax.scan(add, empty, (number, weight / total(weight)[None]))[0]
+    empty = jnp.zeros((weight.shape[1], visibility.shape[1]), weight.dtype)
+    return jax.lax.scan(add, empty, (neighbors, weight / sum_first(weight)[None]))[0]
 
 
 def measure_evenness(
-    hood: Hood, layer: Float[Array, "k block"], spacing: Float[Array, " block"]
+    hood: Neighborhood, membership: Float[Array, "k block"], spacing: Float[Array, " block"]
 ) -> Float[Array, " block"]:
     """Spacings to the nearest other point of the layer; median 0.5 for random points, 0.7 to 0.8 for even ones."""
-    squared = jnp.min(jnp.where(layer[1:] > 0.5, hood.squared[1:], jnp.inf), axis=0)
+    squared = jnp.min(jnp.where(membership[1:] > 0.5, hood.squared[1:], jnp.inf), axis=0)
     return jnp.sqrt(squared) / spacing
 
 
-def find_farthest(place: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
+def find_farthest(uv: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
     """Distance of the farthest point of the plane in each of 16 directions."""
-    turn = jnp.asarray(TURN[: RIM_DIRECTIONS // 2], place.dtype)
-    one, two = jax.lax.optimization_barrier((place[:, 0], place[:, 1]))
+    turn = jnp.asarray(RIM_ANGLES[: NUM_RIM_DIRECTIONS // 2], uv.dtype)
+    one, two = jax.lax.optimization_barrier((uv[:, 0], uv[:, 1]))
 
-    def look(way: tuple[Array, Array]) -> tuple[Array, Array]:
-        ahead = one * way[0] + two * way[1]
+    def look(direction: tuple[Array, Array]) -> tuple[Array, Array]:
+        ahead = one * direction[0] + two * direction[1]
         return largest(ahead), largest(-ahead)
 
     return jnp.concatenate(jax.lax.map(look, (jnp.cos(turn), jnp.sin(turn))))
 
 
 def bridge_gaps(
-    place: Float[Array, "k 2 block"], layer: Float[Array, "k block"], rules: Rules
+    uv: Float[Array, "k 2 block"], membership: Float[Array, "k block"], const: Constants
 ) -> Float[Array, " block"]:
     """Factor by which a disc is enlarged beside gaps, so that the discs around a gap cover its middle.
 
@@ -109,17 +109,17 @@ def bridge_gaps(
     lies there.  Its radius has a local maximum at a Voronoi vertex, and no limit where the layer ends.  After the
     inversion p -> 2 p / |p|^2, the distance of the farthest point in the direction is the curvature of that circle.
     """
-    half = (place[:, 0] ** 2 + place[:, 1] ** 2) / 2
-    other = (layer > 0.5) & (half > rules.same_place)
+    half = (uv[:, 0] ** 2 + uv[:, 1] ** 2) / 2
+    other = (membership > 0.5) & (half > const.duplicate_distance)
     inverse = jnp.where(other, 1 / jnp.where(other, half, 1), 0)
-    curved = find_farthest(place * inverse[:, None])
-    vertex = (curved > 1 / rules.widest_gap) & (curved <= jnp.roll(curved, 1, axis=0))
+    curved = find_farthest(uv * inverse[:, None])
+    vertex = (curved > 1 / const.widest_gap) & (curved <= jnp.roll(curved, 1, axis=0))
     vertex = vertex & (curved <= jnp.roll(curved, -1, axis=0))
-    least = smallest(jnp.where(vertex, curved, 1 / rules.bridged))
-    return larger(1 / (least * rules.bridged), 1)
+    least = smallest(jnp.where(vertex, curved, 1 / const.gap_cover))
+    return larger(1 / (least * const.gap_cover), 1)
 
 
-class Cuts(NamedTuple):
+class ClipLines(NamedTuple):
     """Distances at which neighbors' planes cut a disc (infinite: no cut), and unit directions in the disc's plane."""
 
     distance: Float[Array, "k block"]
@@ -127,87 +127,95 @@ class Cuts(NamedTuple):
     up: Float[Array, "k block"]
 
 
-def find_cuts(
-    hood: Hood,
+def find_clip_lines(
+    hood: Neighborhood,
     axes: Float[Array, "3 3 block"],
     spacing: Float[Array, " block"],
-    sided: Float[Array, " block"],
+    one_sided: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
-    sides: Float[Array, "k block"],
-    rules: Rules,
-) -> Cuts:
+    neighbors_one_sided: Float[Array, "k block"],
+    const: Constants,
+) -> ClipLines:
     """At a sharp edge, the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
-    across, up, facing = (along(normals, axis) for axis in axes)
-    flat = root(across**2 + up**2)
-    cuts = (facing < rules.sharp) & (flat > rules.steep) & (hood.real > 0)
-    cuts = cuts & (sides > 0.5) & (sided > 0.5)[None] & (hood.squared < (rules.rim_within * spacing[None]) ** 2)
-    inverse = jnp.where(cuts, 1 / jnp.where(cuts, flat, 1), 0)
+    across, up, facing = (project_on(normals, axis) for axis in axes)
+    flat = safe_sqrt(across**2 + up**2)
+    clip_lines = (facing < const.edge_cosine) & (flat > const.edge_sine) & (hood.real > 0)
+    clip_lines = (
+        clip_lines
+        & (neighbors_one_sided > 0.5)
+        & (one_sided > 0.5)[None]
+        & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
+    )
+    inverse = jnp.where(clip_lines, 1 / jnp.where(clip_lines, flat, 1), 0)
     line = jnp.sum(normals * hood.offset, axis=1) / spacing[None] * inverse
-    distance = jnp.where(cuts & (line > 0), line + rules.edge, jnp.inf)
-    return Cuts(*jax.lax.optimization_barrier((distance, across * inverse, up * inverse)))
+    distance = jnp.where(clip_lines & (line > 0), line + const.cut_margin, jnp.inf)
+    return ClipLines(*jax.lax.optimization_barrier((distance, across * inverse, up * inverse)))
 
 
 def find_rims(
-    ends: Float[Array, "16 block"], cuts: Cuts, axes: Float[Array, "3 3 block"], rules: Rules
+    ends: Float[Array, "16 block"],
+    clip_lines: ClipLines,
+    axes: Float[Array, "3 3 block"],
+    const: Constants,
 ) -> tuple[Float[Array, "3 block"], Float[Array, "4 block"]]:
     """The direction in which the layer ends first, and the distances of the ends, in the form of `Surfels`.
 
     A layer ends slightly beyond its last point, or where another face cuts it.  The choice of the neighbor or direction
     that ends it is constant for gradients.
     """
-    constant = jax.lax.stop_gradient((cuts.distance, ends))
+    constant = jax.lax.stop_gradient((clip_lines.distance, ends))
     nearest, soonest = jnp.min(constant[0], axis=0), jnp.argmin(constant[1], axis=0)
-    cut = nearest < jnp.min(constant[1], axis=0) + rules.beyond
+    cut = nearest < jnp.min(constant[1], axis=0) + const.rim_margin
     first = (constant[0] <= nearest[None]) & cut[None]
-    turn = jnp.asarray(TURN, ends.dtype)
-    way = [
-        jnp.where(cut, total(jnp.where(first, ways, 0)), of_turn[soonest])
-        for ways, of_turn in ((cuts.across, jnp.cos(turn)), (cuts.up, jnp.sin(turn)))
+    turn = jnp.asarray(RIM_ANGLES, ends.dtype)
+    direction = [
+        jnp.where(cut, sum_first(jnp.where(first, components, 0)), of_turn[soonest])
+        for components, of_turn in ((clip_lines.across, jnp.cos(turn)), (clip_lines.up, jnp.sin(turn)))
     ]
-    right, high = unit(jnp.stack(way))
+    right, high = unit(jnp.stack(direction))
 
-    def reach(way: tuple[Array, Array]) -> Array:
-        right, high = way
-        aligned = cuts.across * right[None] + cuts.up * high[None] > rules.aligned
-        line = smallest(jnp.where(aligned, cuts.distance, jnp.inf))
+    def find_end(direction: tuple[Array, Array]) -> Array:
+        right, high = direction
+        cut_cosine = clip_lines.across * right[None] + clip_lines.up * high[None] > const.cut_cosine
+        line = smallest(jnp.where(cut_cosine, clip_lines.distance, jnp.inf))
         angle = jnp.arctan2(*jax.lax.stop_gradient((high, right)))
-        step = jnp.round(angle / (2 * jnp.pi) * RIM_DIRECTIONS).astype(jnp.int32) % RIM_DIRECTIONS
+        step = jnp.round(angle / (2 * jnp.pi) * NUM_RIM_DIRECTIONS).astype(jnp.int32) % NUM_RIM_DIRECTIONS
         end = jnp.take_along_axis(ends, step[None], axis=0)[0]
         return jnp.where(line < jnp.inf, jnp.where(line < jnp.inf, line, 0), end)
 
     quarters = jnp.stack([right, -right, -high, high]), jnp.stack([high, -high, right, -right])
-    return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(reach, quarters), rules.far)
+    return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(find_end, quarters), const.largest_radius)
 
 
-def find_border(
-    place: Float[Array, "k 2 block"],
-    layer: Float[Array, "k block"],
+def find_color_edge(
+    uv: Float[Array, "k 2 block"],
+    membership: Float[Array, "k block"],
     spacing: Float[Array, " block"],
     axes: Float[Array, "3 3 block"],
     colors: Float[Array, "k 3 block"],
-    rules: Rules,
+    const: Constants,
 ) -> dict[str, Array]:
-    """The fields `border` (4, block) and `jump` (3, block): a straight border between two colors, where there is one.
+    """The fields `color_edge` (4, block) and `color_jump` (3, block): a straight edge between two colors, if any.
 
-    With one color per disc, a border would look frayed at the scale of the spacing.  Borders fade in smoothly.  Which
+    With one color per disc, an edge would look frayed at the scale of the spacing.  Edges fade in smoothly.  Which
     neighbors have the other color is constant for gradients.
     """
-    squared = place[:, 0] ** 2 + place[:, 1] ** 2
-    weight = layer * jnp.exp(-0.5 / rules.border_within**2 * squared)
-    weight = jax.lax.optimization_barrier(weight / total(weight)[None])
-    roots, change = root(colors), colors - colors[:1]
+    squared = uv[:, 0] ** 2 + uv[:, 1] ** 2
+    weight = membership * jnp.exp(-0.5 / const.color_edge_sigma**2 * squared)
+    weight = jax.lax.optimization_barrier(weight / sum_first(weight)[None])
+    roots, change = safe_sqrt(colors), colors - colors[:1]
     roots = roots - roots[:1]
-    beyond = _part(weight, jax.lax.stop_gradient(roots))
-    plane = jnp.concatenate([jnp.ones_like(place[:, :1]), place], axis=1)
-    products = jnp.stack([place[:, 0] ** 2, place[:, 0] * place[:, 1], place[:, 1] ** 2], axis=1)
-    sides = jnp.stack([weight * ~beyond, weight * beyond], axis=1)
+    beyond = _split_colors(weight, jax.lax.stop_gradient(roots))
+    plane = jnp.concatenate([jnp.ones_like(uv[:, :1]), uv], axis=1)
+    products = jnp.stack([uv[:, 0] ** 2, uv[:, 0] * uv[:, 1], uv[:, 1] ** 2], axis=1)
+    groups = jnp.stack([weight * ~beyond, weight * beyond], axis=1)
     spread = jnp.sum(roots**2, axis=1)[:, None]
-    own, other = sum_products(sides, jnp.concatenate([plane, products, change, roots, spread], axis=1))
-    way, distance, wrong = _find_line(place, weight, beyond, own, other, rules)
-    sure = _trust(own, other, rules) * _ramp(wrong, rules.wrong_side)
-    border = [way[0][None] * axes[0] + way[1][None] * axes[1], (distance * spacing)[None]]
-    jump = sure[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
-    return {"border": jnp.concatenate(border), "jump": jump}
+    own, other = sum_products(groups, jnp.concatenate([plane, products, change, roots, spread], axis=1))
+    direction, distance, wrong = _find_line(uv, weight, beyond, own, other, const)
+    confidence = _measure_confidence(own, other, const) * _ramp(wrong, const.wrong_side)
+    edge = [direction[0][None] * axes[0] + direction[1][None] * axes[1], (distance * spacing)[None]]
+    jump = confidence[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
+    return {"color_edge": jnp.concatenate(edge), "color_jump": jump}
 
 
 def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Array, " block"]:
@@ -215,31 +223,37 @@ def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Ar
     return clamp((values - ends[0]) / (ends[1] - ends[0]), 0, 1)
 
 
-def _part(weight: Float[Array, "k block"], change: Float[Array, "k 3 block"]) -> Bool[Array, "k block"]:
+def _split_colors(weight: Float[Array, "k block"], change: Float[Array, "k 3 block"]) -> Bool[Array, "k block"]:
     """Which neighbors have another color than the point: those closer to the most different color than to its own."""
     differing = jax.lax.optimization_barrier(weight * jnp.sum(change**2, axis=1))
     most = (differing == jnp.max(differing, axis=0)[None]).astype(weight.dtype)
-    axis = total(most[:, None] * change) / total(most)[None]
-    return along(change, axis) > 0.5 * dot(axis, axis)[None]
+    axis = sum_first(most[:, None] * change) / sum_first(most)[None]
+    return project_on(change, axis) > 0.5 * dot(axis, axis)[None]
 
 
-def _trust(own: Float[Array, "sums block"], other: Float[Array, "sums block"], rules: Rules) -> Float[Array, " block"]:
+def _measure_confidence(
+    own: Float[Array, "sums block"], other: Float[Array, "sums block"], const: Constants
+) -> Float[Array, " block"]:
     """Confidence that there are two colors, from the moments of square roots of linear colors."""
     apart = _mean(other, ROOTS) - _mean(own, ROOTS)
     whole = own + other
     variance = larger(whole[SPREAD] - dot(whole[ROOTS], whole[ROOTS]), 1e-9)
     between = own[0] * other[0] * dot(apart, apart) / variance
     contrast = largest(jnp.abs(apart))
-    return _ramp(other[0], rules.far_share) * _ramp(contrast, rules.contrast) * _ramp(between, rules.parted)
+    return (
+        _ramp(other[0], const.other_color_share)
+        * _ramp(contrast, const.contrast)
+        * _ramp(between, const.parted_variance)
+    )
 
 
 def _find_line(
-    place: Float[Array, "k 2 block"],
+    uv: Float[Array, "k 2 block"],
     weight: Float[Array, "k block"],
     beyond: Bool[Array, "k block"],
     own: Float[Array, "sums block"],
     other: Float[Array, "sums block"],
-    rules: Rules,
+    const: Constants,
 ) -> tuple[Float[Array, "2 block"], Float[Array, " block"], Float[Array, " block"]]:
     """Unit direction across the line, distance of the line along it, and the share of neighbors on the wrong side.
 
@@ -251,14 +265,14 @@ def _find_line(
     normal = jnp.stack(
         [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
     )
-    way = unit(_solve_plane(normal, rules.border_ridge)[:, 0])
-    height = jax.lax.optimization_barrier(place[:, 0] * way[0][None] + place[:, 1] * way[1][None])
-    there = weight > rules.border_least
+    direction = unit(_solve_plane(normal, const.color_edge_ridge)[:, 0])
+    height = jax.lax.optimization_barrier(uv[:, 0] * direction[0][None] + uv[:, 1] * direction[1][None])
+    there = weight > const.color_edge_least_weight
     last = largest(jnp.where(there & ~beyond, height, 0))  # the point itself lies at 0
     first = smallest(jnp.where(there & beyond, height, jnp.inf))
     some = first < jnp.inf
     distance = larger(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
-    return way, distance, total(weight * (beyond != (height > distance[None])))
+    return direction, distance, sum_first(weight * (beyond != (height > distance[None])))
 
 
 def _solve_plane(normal: Float[Array, "3 columns block"], ridge: float) -> Float[Array, "2 sides block"]:

@@ -35,7 +35,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 HIGHEST = 3  # degree
 
 
-def coefficients(degree: int) -> int:
+def count_coefficients(degree: int) -> int:
     """Number of harmonics up to a degree."""
     return (degree + 1) ** 2
 
@@ -43,12 +43,12 @@ def coefficients(degree: int) -> int:
 def degree_of(count: int) -> int:
     """The degree that has this number of coefficients; ValueError if there is none."""
     for degree in range(HIGHEST + 1):
-        if coefficients(degree) == count:
+        if count_coefficients(degree) == count:
             return degree
     raise UserError(f"spherical harmonics have 1, 4, 9 or 16 coefficients, got {count}")
 
 
-def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArray, "*batch coefficients"]:
+def evaluate_harmonics(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArray, "*batch coefficients"]:
     """All harmonics up to a degree, 0 to 3, of unit vectors; NumPy in, NumPy out."""
     x, y, z = (directions[..., i] for i in range(3))
     xx, yy, zz = x * x, y * y, z * z
@@ -68,8 +68,8 @@ def basis(directions: Float[AnyArray, "*batch 3"], degree: int) -> Float[AnyArra
 
 def half_turn_signs(degree: int) -> Float[np.ndarray, " coefficients"]:
     """Signs of the coefficients after half a turn of the colour around the x axis: (x, y, z) -> (x, -y, -z)."""
-    place = np.array([0.36, 0.48, 0.8])
-    return np.sign(basis(place * [1, -1, -1], degree) * basis(place, degree))
+    place_splats = np.array([0.36, 0.48, 0.8])
+    return np.sign(evaluate_harmonics(place_splats * [1, -1, -1], degree) * evaluate_harmonics(place_splats, degree))
 
 
 STRIDE = 2  # every second pixel of each axis is unprojected
@@ -90,14 +90,14 @@ class View(NamedTuple):
     depth: Float[np.ndarray, "height width"]
 
 
-class Seen(NamedTuple):
+class SurfacePoints(NamedTuple):
     """Unprojected pixels: positions, and normals that face the viewer."""
 
     position: Float[np.ndarray, "pixels 3"]
     normal: Float[np.ndarray, "pixels 3"]
 
 
-def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> Seen:
+def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> SurfacePoints:
     """The surface points that the views show; ValueError if they show none."""
     found, rays = [], []
     for i, view in enumerate(views):
@@ -120,30 +120,30 @@ def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRID
     kept = (distance < WITHIN * spacing) & (above < OFF_PLANE * spacing) & (np.abs(facing) > GRAZING)
     if not kept.any():
         raise UserError("the network's pictures show no surface to put splats on")
-    return Seen(position[kept], (normal * np.sign(facing)[:, None])[kept])
+    return SurfacePoints(position[kept], (normal * np.sign(facing)[:, None])[kept])
 
 
-def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
+def place_splats(surface: SurfacePoints, *, most: int, pixel: float) -> tuple[Gaussians, float]:
     """Grey splats, `most` or fewer, and the side of the cubes; `pixel` is the width of a pixel on the surface."""
     side = max(FINEST * pixel, 1e-9)
-    low = seen.position.min(axis=0)
+    low = surface.position.min(axis=0)
     for _ in range(TRIES):
-        number, group = _groups(seen, low, side)
+        number, group = _group_pixels(surface, low, side)
         if number <= most and (number >= ENOUGH * most or side <= FINEST * pixel):
             break
         side = max(side * np.sqrt(number / (0.5 * (1 + ENOUGH) * most)), FINEST * pixel)
     while number > most:
         side *= 1.1
-        number, group = _groups(seen, low, side)
+        number, group = _group_pixels(surface, low, side)
     count = np.bincount(group, minlength=number)[:, None]
     position, normal = (
-        np.stack([np.bincount(group, x[:, i], number) for i in range(3)], axis=-1) / count for x in seen
+        np.stack([np.bincount(group, x[:, i], number) for i in range(3)], axis=-1) / count for x in surface
     )
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     scale = np.broadcast_to(np.array([WIDTH, WIDTH, THICKNESS], np.float32) * side, (number, 3))
     placed = Gaussians(
         position=(position - INSET * pixel * normal).astype(np.float32),
-        rotation=turn_to(normal).astype(np.float32),
+        rotation=rotate_to(normal).astype(np.float32),
         scale=np.array(scale),
         opacity=np.full(number, OPACITY, np.float32),
         harmonics=np.zeros((number, 1, 3), np.float32),
@@ -151,17 +151,17 @@ def place(seen: Seen, *, most: int, pixel: float) -> tuple[Gaussians, float]:
     return placed, float(side)
 
 
-def _groups(seen: Seen, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
+def _group_pixels(surface: SurfacePoints, low: np.ndarray, side: float) -> tuple[int, np.ndarray]:
     """Number of splats for cubes of this side, and the splat to which each pixel belongs."""
-    cube = ((seen.position - low) / side).astype(np.int64)
-    axis = np.abs(seen.normal).argmax(axis=1)
-    face = 2 * axis + (np.take_along_axis(seen.normal, axis[:, None], axis=1)[:, 0] > 0)
+    cube = ((surface.position - low) / side).astype(np.int64)
+    axis = np.abs(surface.normal).argmax(axis=1)
+    face = 2 * axis + (np.take_along_axis(surface.normal, axis[:, None], axis=1)[:, 0] > 0)
     key = ((cube[:, 0] << 40 | cube[:, 1] << 20 | cube[:, 2]) << 3) | face
     names, group = np.unique(key, return_inverse=True)
     return len(names), group.ravel()
 
 
-def rotations(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "splats 3 3"]:
+def rotation_matrices(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "splats 3 3"]:
     """Rotation matrices of unit quaternions w x y z."""
     w, x, y, z = np.asarray(quaternion).T
     rows = (
@@ -172,7 +172,7 @@ def rotations(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "s
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def turn_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
+def rotate_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:
     """Quaternions w x y z that rotate the third axis to a normal; some include half a turn around the first axis."""
     below = normal[:, 2:] < 0
     x, y, z = np.split(normal * np.where(below, -1, 1), 3, axis=-1)
@@ -189,17 +189,20 @@ LEAST_FACING = 0.05  # weight of a splat that is seen edge-on
 RIDGE = 0.4  # of the higher degrees; its unit is one view
 BEFORE = 2.5  # sides of a cube in front of a picture's depth beyond which the view contradicts a splat
 EMPTY = 0.5  # opacity below which a picture is empty
-FEW, ALWAYS = 0.12, 0.5  # contradicting views that are tolerated: share of the views that see the splat, plus a number
+TOLERATED_SHARE, TOLERATED = (
+    0.12,
+    0.5,
+)  # contradicting views that are tolerated: share of the views that see the splat, plus a number
 
 
-def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
+def color_splats(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:
     """The splats with colours fitted to the views, up to a degree 0 to 3; splats that no view sees are dropped."""
     position = np.asarray(gaussians.position)
-    normal = rotations(np.asarray(gaussians.rotation))[:, :, 2]
-    count = coefficients(degree)
+    normal = rotation_matrices(np.asarray(gaussians.rotation))[:, :, 2]
+    count = count_coefficients(degree)
     matrix = np.zeros((len(position), count, count), np.float32)
     right = np.zeros((len(position), count, 3), np.float32)
-    seen, against = np.zeros((2, len(position)), np.int32)
+    seeing, contradicting = np.zeros((2, len(position)), np.int32)
     for view in views:
         towards = position - np.asarray(view.camera.cam_to_world)[:, 3]
         distance = np.linalg.norm(towards, axis=1)
@@ -209,24 +212,24 @@ def color(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: i
         with np.errstate(invalid="ignore"):
             near = inside & (distance < depth + BEHIND * side)
             before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
-        against += before | (inside & (opacity < EMPTY))
+        contradicting += before | (inside & (opacity < EMPTY))
         cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on both sides
         visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
         facing = cosine[visible]
         weight = np.maximum(facing, LEAST_FACING)[:, None].astype(np.float32)
         opacity = opacity[visible, None]
-        seen_color = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
-        harmonics = np.asarray(basis(towards[visible].astype(np.float32), degree))
+        observed = (view.image[row[visible], column[visible]] - (1 - opacity)) / opacity
+        harmonics = np.asarray(evaluate_harmonics(towards[visible].astype(np.float32), degree))
         matrix[visible] += (weight * harmonics)[:, :, None] * harmonics[:, None]
-        right[visible] += (weight * harmonics)[:, :, None] * (seen_color - 0.5)[:, None]
-        seen[visible] += 1
-    held = np.diag([1e-4] + [RIDGE / (4 * np.pi)] * (count - 1)).astype(np.float32)
-    shown = (seen > 0) & (against <= FEW * seen + ALWAYS)
-    if not shown.any():
+        right[visible] += (weight * harmonics)[:, :, None] * (observed - 0.5)[:, None]
+        seeing[visible] += 1
+    ridge = np.diag([1e-4] + [RIDGE / (4 * np.pi)] * (count - 1)).astype(np.float32)
+    kept = (seeing > 0) & (contradicting <= TOLERATED_SHARE * seeing + TOLERATED)
+    if not kept.any():
         raise UserError("the pictures agree on no surface; give more views")
-    harmonics = np.linalg.solve(matrix[shown] + held, right[shown])
-    kept = {name: np.asarray(x)[shown] for name, x in vars(gaussians).items()}
-    return Gaussians(**kept | {"harmonics": harmonics.astype(np.float32)})
+    harmonics = np.linalg.solve(matrix[kept] + ridge, right[kept])
+    columns = {name: np.asarray(x)[kept] for name, x in vars(gaussians).items()}
+    return Gaussians(**columns | {"harmonics": harmonics.astype(np.float32)})
 
 
 def nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -1,11 +1,12 @@
 """Surfels from points: the surface around each point, estimated by one pure program over given neighbors.
 
 neighbors   the nearest points of each point, found once on the host with a k-d tree; integers without a gradient
-spacing     side of the square that a point represents, from the neighbors on the same layer of the surface
+spacing     side of the square that a point represents.  Three estimates follow each other: the raw spacing from 6
+            neighbors on any layer, the spacing from the neighbors on the same layer, and its mean over 9 of these
 normal      given, or else that of the layer (layers.py); the outer side is found by votes (sides.py)
-sided       1 where the votes agree on the outer side, 0 where both sides are equally visible (a sheet)
-border      a straight border between two colors inside a disc, and the jump of color across it (discs.py)
-rim, reach  where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
+one_sided   1 where the votes agree on the outer side, 0 where both sides are equally visible (a two-sided disc)
+color_edge  a straight edge between two colors inside a disc; color_jump is the change of color across it (discs.py)
+rim         where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
 scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
@@ -13,7 +14,7 @@ Points are processed in blocks, one after the other, so that a million fit into 
 from arrays of all points, which are (columns, points) in this file.
 
 Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
-are constants without a gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a
+are const without a gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a
 disc or has another color, sides and flips of normals, and visibility from each direction.
 """
 
@@ -27,11 +28,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.kernels.numerics import clamp, dot, frame, largest, length, measure_shape, root, smallest, unit
+from spnr_jax.kernels.numerics import (
+    clamp,
+    dot,
+    largest,
+    length,
+    measure_shape,
+    safe_sqrt,
+    smallest,
+    tangent_frame,
+    unit,
+)
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels import discs, layers, sides
-from spnr_jax.surfels.layers import NEIGHBORS, RULES, Hood, Layer, Rules, along
-from spnr_jax.surfels.sides import cell_of, grid_of, see_directions
+from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS, Constants, Layer, Neighborhood, project_on
+from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 # --- neighbors, on the host -------------------------------------------------------------------------------------------
 
@@ -56,7 +67,7 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
 
 def nearest(positions: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 20"]:
     """Indices of the nearest points of real points, -1 where there are fewer; each point is its own first neighbor."""
-    return _ask(cKDTree(positions), np.arange(len(positions)))
+    return _query(cKDTree(positions), np.arange(len(positions)))
 
 
 def order_in_space(
@@ -68,22 +79,22 @@ def order_in_space(
     """
     tree = cKDTree(positions)
     order = tree.indices
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    near = _ask(tree, order)
-    return order, np.where(near < 0, np.int32(-1), place[near])
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    near = _query(tree, order)
+    return order, np.where(near < 0, np.int32(-1), rank[near])
 
 
-def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
+def _query(tree: cKDTree, queried: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
     """Neighbors of the points with these indices, -1 for none; each point comes first, even among duplicates."""
     ranks = list(range(1, min(NEIGHBORS, tree.n) + 1))
-    blocks = [asked[i : i + BLOCK] for i in range(0, len(asked), BLOCK)]
+    blocks = [queried[i : i + BLOCK] for i in range(0, len(queried), BLOCK)]
     found = np.concatenate([tree.query(tree.data[rows], ranks, workers=-1)[1].astype(np.int32) for rows in blocks])
-    wrong = np.flatnonzero(found[:, 0] != asked)
+    wrong = np.flatnonzero(found[:, 0] != queried)
     if len(wrong):
-        own = found[wrong] == asked[wrong, None]
+        own = found[wrong] == queried[wrong, None]
         lost = ~own.any(axis=1)  # the point is missing from its own list: it has too many duplicates
-        own[lost, -1], found[wrong[lost], -1] = True, asked[wrong[lost]]
+        own[lost, -1], found[wrong[lost], -1] = True, queried[wrong[lost]]
         found[wrong] = np.take_along_axis(found[wrong], np.argsort(~own, axis=1, kind="stable"), axis=1)
     return np.pad(found, [(0, 0), (0, NEIGHBORS - found.shape[1])], constant_values=-1)
 
@@ -91,20 +102,20 @@ def _ask(tree: cKDTree, asked: Int[np.ndarray, " some"]) -> Int[np.ndarray, "som
 # --- surfels ----------------------------------------------------------------------------------------------------------
 
 
-class Points(NamedTuple):
+class PointColumns(NamedTuple):
     """All points of a cloud as columns, zeros for padding, and the indices of their neighbors.
 
-    `given` says which points came with an oriented normal.
+    `oriented` says which points came with an oriented normal.
     """
 
-    number: Int[Array, "k points"]
+    neighbors: Int[Array, "k points"]
     mask: Bool[Array, " points"]
-    given: Bool[Array, " points"]
+    oriented: Bool[Array, " points"]
     position: Float[Array, "3 points"]
     color: Float[Array, "3 points"]
 
 
-def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rules: Rules = RULES) -> Surfels:
+def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], const: Constants = CONSTANTS) -> Surfels:
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
     One surfel per point, in the same order; `mask` is False for padding.
@@ -117,22 +128,22 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], rule
         return layers.select(mask, jnp.asarray(values).T, 0)
 
     normals = None if cloud.normals is None else unit(columns(cloud.normals))
-    points = Points(
-        number=layers.select(mask, jnp.asarray(neighbors).T, -1),
+    points = PointColumns(
+        neighbors=layers.select(mask, jnp.asarray(neighbors).T, -1),
         mask=mask,
-        given=jnp.zeros_like(mask) if normals is None else dot(normals, normals) > 0.5,
+        oriented=jnp.zeros_like(mask) if normals is None else dot(normals, normals) > 0.5,
         position=columns(cloud.positions),
         color=columns(cloud.base_color),
     )
-    raw, layer = find_layers(points, normals, sided=True, sheets=normals is None, rules=rules)
-    seen = estimate_visibility(points, layer.normal, raw, rules)
-    normal, sided = find_sides(points, raw, layer, seen, rules)
-    fields = describe(points, raw, layer, normal, sided, seen, rules)
-    known = jnp.ones_like(raw) if cloud.materials_known is None else columns(cloud.materials_known)
-    learned = jnp.zeros_like(raw) if cloud.invented is None else columns(cloud.invented)
+    raw_spacing, layer = find_layers(points, normals, oriented=True, split_by_color=normals is None, const=const)
+    visibility = estimate_visibility(points, layer.normal, raw_spacing, const)
+    normal, one_sided = orient_layers(points, raw_spacing, layer, visibility, const)
+    fields = describe_discs(points, raw_spacing, layer, normal, one_sided, visibility, const)
+    known = jnp.ones_like(raw_spacing) if cloud.materials_known is None else columns(cloud.materials_known)
+    learned = jnp.zeros_like(raw_spacing) if cloud.learned is None else columns(cloud.learned)
     fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic)}
-    fields |= {"guessed": 1 - known, "invented": learned}
-    fields |= {"position": points.position, "normal": normal, "base_color": points.color, "sided": sided}
+    fields |= {"materials_unknown": 1 - known, "learned": learned}
+    fields |= {"position": points.position, "normal": normal, "base_color": points.color, "one_sided": one_sided}
     fields = {name: jnp.moveaxis(layers.select(mask, values, 0), -1, 0) for name, values in fields.items()}
     fields["spacing"] = jnp.where(mask, fields["spacing"], 1)  # its logarithm is taken
     return Surfels(**fields, mask=mask)
@@ -147,27 +158,31 @@ def median(values: Float[Array, " points"], mask: Bool[Array, " points"]) -> Flo
 
 
 def map_blocks(
-    work: Callable[..., Any], points: Points, columns: Float[Array, "columns points"], rules: Rules, *own: Any
+    work: Callable[..., Any],
+    points: PointColumns,
+    columns: Float[Array, "columns points"],
+    const: Constants,
+    *own: Any,
 ) -> Any:
     """The results of `work` for all blocks of points, concatenated.
 
-    `work` receives the neighborhoods of a block (with these columns of the neighbors), the neighbors' indices, and the
-    block's part of the `own` arrays (..., points).  All values of a block travel in one array.  For the gradient, only
+    `work` receives the neighborhoods of a block (with these columns of the neighbors) and the block's part of the `own`
+    arrays (..., points).  All values of a block travel in one array.  For the gradient, only
     the inputs of a block are kept, and the block is computed again.
     """
     count = points.mask.shape[0]
-    size = min(rules.block, count)
+    size = min(const.block_size, count)
     table = jnp.concatenate([points.position, columns])
-    number, packed = points.number, _pack((points.position, own))
+    neighbors, packed = points.neighbors, _pack((points.position, own))
     forms: list[Any] = []
 
-    def compute(number: Array, packed: Array) -> Array:
-        place, values = _unpack(packed, (points.position, own))
-        out = work(layers.look_around(number, place, table), number, *values)
+    def compute(neighbors: Array, packed: Array) -> Array:
+        positions, values = _unpack(packed, (points.position, own))
+        out = work(layers.gather_neighborhoods(neighbors, positions, table), *values)
         forms.append(out)
         return _pack(out)
 
-    def skip(number: Array, packed: Array) -> Array:
+    def skip(neighbors: Array, packed: Array) -> Array:
         rows = sum(leaf.size // size for leaf in jax.tree.leaves(forms[-1]))
         return jnp.zeros((rows, size), packed.dtype)
 
@@ -175,9 +190,9 @@ def map_blocks(
         return jax.lax.cond(jnp.any(block[0] >= 0), compute, skip, *block)  # blocks of padding cost nothing
 
     if size == count:
-        return _unpack(jax.checkpoint(compute)(number, packed), forms[-1])
+        return _unpack(jax.checkpoint(compute)(neighbors, packed), forms[-1])
 
-    found = jax.lax.map(jax.checkpoint(one), (_split(number, size, -1), _split(packed, size, 0)))
+    found = jax.lax.map(jax.checkpoint(one), (_split(neighbors, size, -1), _split(packed, size, 0)))
     return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
 
 
@@ -208,154 +223,167 @@ def _unpack(packed: Float[Array, "columns points"], form: Any) -> Any:
 
 
 def find_layers(
-    points: Points,
+    points: PointColumns,
     normals: Float[Array, "3 points"] | None,
     *,
-    sided: bool,
-    sheets: bool,
-    rules: Rules = RULES,
+    oriented: bool,
+    split_by_color: bool,
+    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, " points"], Layer]:
-    """First spacings, and layers from unit normals (0 where there is none).
+    """Raw spacings, and layers from unit normals (0 where there is none).
 
-    Normals are kept.  If `sided`, they are oriented, and separate the two sides of a wall.  With `sheets`, a point near
-    two sheets closer than the thickness of a layer is assigned to one of them by its linear color.
+    Normals are kept.  If `oriented`, they separate the two sides of a thin wall.  With `split_by_color`, a point near
+    two surfaces closer than the thickness of a layer is assigned to one of them by its linear color.
     """
-    roots = root(points.color)
+    roots = safe_sqrt(points.color)
 
-    def fit(hood: Hood, number: Array, *own: Array) -> tuple[Array, Layer, layers.Sheets | None]:
-        raw = discs.first_spacing(hood, rules)
-        weight = layers.weigh_near(hood, raw, rules)
-        first, firm = layers.begin_normals(hood, raw, *own, rules=rules)
-        if sided and own:
-            weight = weight * jnp.where(firm[None], clamp(0.5 + along(hood.columns[:, 3:], first), 0, 1), 1)
-        unlike = layers.compare_colors(hood, hood.columns[:, :3], rules) if sheets else None
-        return raw, *layers.fit_layers(hood, raw, first, weight, firm, unlike, rules)
+    def fit(hood: Neighborhood, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
+        raw_spacing = discs.measure_raw_spacing(hood, const)
+        weight = layers.weigh_distance(hood, raw_spacing, const)
+        first, fixed = layers.init_normals(hood, raw_spacing, *own, const=const)
+        if oriented and own:
+            weight = weight * jnp.where(fixed[None], clamp(0.5 + project_on(hood.columns[:, 3:], first), 0, 1), 1)
+        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3], const) if split_by_color else None
+        return raw_spacing, *layers.fit_layers(hood, raw_spacing, first, weight, fixed, color_distance, const)
 
     given = () if normals is None else (normals,)
-    raw, layer, found = map_blocks(fit, points, jnp.concatenate([roots, *given]), rules, *given)
-    if found is None:
-        return raw, layer
+    raw_spacing, layer, split = map_blocks(fit, points, jnp.concatenate([roots, *given]), const, *given)
+    if split is None:
+        return raw_spacing, layer
 
-    def agree(hood: Hood, number: Array, layer: Layer, found: layers.Sheets) -> Layer:
-        unlike = layers.compare_colors(hood, hood.columns[:, :3], rules)
-        return layers.agree_on_sheets(hood, layer, found, unlike, hood.columns[:, 3], rules)
+    def keep_agreed(hood: Neighborhood, layer: Layer, split: layers.SplitLayer) -> Layer:
+        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3], const)
+        return layers.keep_agreed_splits(hood, layer, split, color_distance, hood.columns[:, 3], const)
 
-    table = jnp.concatenate([roots, found.certain[None].astype(raw.dtype)])
+    table = jnp.concatenate([roots, split.certain[None].astype(raw_spacing.dtype)])
     layer = jax.lax.cond(
-        jnp.any(found.certain), lambda: map_blocks(agree, points, table, rules, layer, found), lambda: layer
+        jnp.any(split.certain), lambda: map_blocks(keep_agreed, points, table, const, layer, split), lambda: layer
     )
-    return raw, layer
+    return raw_spacing, layer
 
 
 def estimate_visibility(
-    points: Points, normal: Float[Array, "3 points"], spacing: Float[Array, " points"], rules: Rules = RULES
+    points: PointColumns,
+    normal: Float[Array, "3 points"],
+    spacing: Float[Array, " points"],
+    const: Constants = CONSTANTS,
 ) -> Float[Array, "64 points"]:
     """Visibility of each point from each of 64 directions."""
-    middle, grid = median(spacing, points.mask), grid_of(points.mask.shape[0])
-    low, high = rules.bounds_seen
+    middle, grid = median(spacing, points.mask), choose_grid(points.mask.shape[0])
+    low, high = const.visibility_spacing_bounds
     bounded = jnp.clip(spacing, low * middle, high * middle)
-    return see_directions(points.position, normal, bounded, points.mask, cell_of(middle, grid), grid=grid)
+    return compute_visibility(points.position, normal, bounded, points.mask, choose_cell(middle, grid), grid=grid)
 
 
-def find_sides(
-    points: Points,
-    raw: Float[Array, " points"],
+def orient_layers(
+    points: PointColumns,
+    raw_spacing: Float[Array, " points"],
     layer: Layer,
-    seen: Float[Array, "64 points"],
-    rules: Rules = RULES,
+    visibility: Float[Array, "64 points"],
+    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """Normals that point outward, and the confidence in that (`sided`)."""
-    turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw, layer))
-    position, raw, layer = fixed
+    """Normals that point outward, and the confidence in that (`one_sided`)."""
+    turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw_spacing, layer))
+    position, raw_spacing, layer = fixed
     points = points._replace(position=position)
-    front, back = sides.count_facing(layer.normal, seen)
+    front, back = sides.sum_visibility(layer.normal, visibility)
 
     def vote(votes: Array, first: Array) -> tuple[Array, None]:
-        def share(hood: Hood, number: Array, raw: Array, layer: Layer, given: Array) -> Array:
+        def combine(hood: Neighborhood, raw_spacing: Array, layer: Layer, oriented: Array) -> Array:
             normals, votes = hood.columns[:, :3], hood.columns[:, 3]
-            walls = sides.vote_of_walls(hood, layer, raw, normals, given, rules)
-            return sides.share_votes(hood, layer, raw, normals, votes, rules) + first * walls
+            walls = sides.vote_by_thin_walls(hood, layer, raw_spacing, normals, oriented, const)
+            return sides.average_votes(hood, layer, raw_spacing, normals, votes, const) + first * walls
 
         table = jnp.concatenate([layer.normal, votes[None]])
-        return jnp.clip(map_blocks(share, points, table, rules, raw, layer, points.given), -1, 1), None
+        return jnp.clip(map_blocks(combine, points, table, const, raw_spacing, layer, points.oriented), -1, 1), None
 
-    leans = (front - back) / (front + back + rules.evidence)
-    towards, _ = jax.lax.scan(vote, leans, jnp.asarray([1, 0], raw.dtype))
-    return sides.turn_outward(turned, towards, points.given, rules)
+    votes = (front - back) / (front + back + const.vote_ridge)
+    towards, _ = jax.lax.scan(vote, votes, jnp.asarray([1, 0], raw_spacing.dtype))
+    return sides.orient_normals(turned, towards, points.oriented, const)
 
 
-def describe(
-    points: Points,
-    raw: Float[Array, " points"],
+def describe_discs(
+    points: PointColumns,
+    raw_spacing: Float[Array, " points"],
     layer: Layer,
     normal: Float[Array, "3 points"],
-    sided: Float[Array, " points"],
-    seen: Float[Array, "64 points"],
-    rules: Rules = RULES,
+    one_sided: Float[Array, " points"],
+    visibility: Float[Array, "64 points"],
+    const: Constants = CONSTANTS,
 ) -> dict[str, Array]:
     """The fields of `Surfels` that follow from layers and sides (..., points)."""
-    rough, weight, random = find_spacings(points, raw, layer, normal, sided, rules)
+    layer_spacing, weight, random = measure_spacings(points, raw_spacing, layer, normal, one_sided, const)
 
     def work(
-        hood: Hood, number: Array, raw: Array, layer: Layer, weight: Array, normal: Array, sided: Array
+        hood: Neighborhood,
+        raw_spacing: Array,
+        layer: Layer,
+        weight: Array,
+        normal: Array,
+        one_sided: Array,
     ) -> dict[str, Array]:
-        normals, colors, sides, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
-        axes, spacing = frame(normal), discs.smooth_spacing(weight, spacings[:, 0], rules)
-        flat = jnp.stack([along(hood.offset, axis) for axis in axes[:2]], axis=1)
-        wider = discs.bridge_gaps(flat / spacing[None, None], weight, rules)
+        normals, colors, neighbors_one_sided, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
+        axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0], const)
+        flat = jnp.stack([project_on(hood.offset, axis) for axis in axes[:2]], axis=1)
+        wider = discs.bridge_gaps(flat / spacing[None, None], weight, const)
         spacing = spacing * jnp.where(random, wider, 1)
-        place = jax.lax.optimization_barrier(flat / spacing[None, None])
-        there = (weight > 0.5) & (hood.squared < (rules.rim_within * spacing[None]) ** 2)
-        ends = discs.find_farthest(jnp.where(there[:, None], place, 0)) + rules.beyond
-        cuts = discs.find_cuts(hood, axes, spacing, sided, normals, sides[:, 0], rules)
-        rim, reach = discs.find_rims(ends, cuts, axes, rules)
-        fitted = discs.find_border(place, weight, spacing, axes, colors, rules)
-        own = layers.weigh_near(hood, raw, rules) * layers.weigh_height(layer)
-        return fitted | {
+        uv = jax.lax.optimization_barrier(flat / spacing[None, None])
+        nearby = (weight > 0.5) & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
+        ends = discs.find_farthest(jnp.where(nearby[:, None], uv, 0)) + const.rim_margin
+        clip_lines = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, neighbors_one_sided[:, 0], const)
+        rim_tangent, rim_distances = discs.find_rims(ends, clip_lines, axes, const)
+        color_edge = discs.find_color_edge(uv, weight, spacing, axes, colors, const)
+        own = layers.weigh_distance(hood, raw_spacing, const) * layers.weigh_height(layer)
+        return color_edge | {
             "spacing": spacing,
-            "shape": measure_shape(layers.measure_covariance(hood, raw, own)),
-            "rim": rim,
-            "reach": reach,
+            "shape_ratios": measure_shape(layers.measure_covariance(hood, raw_spacing, own)),
+            "rim_tangent": rim_tangent,
+            "rim_distances": rim_distances,
         }
 
-    table = jnp.concatenate([normal, points.color, sided[None], rough[None]])
-    fields = map_blocks(work, points, table, rules, raw, layer, weight, normal, sided)
-    return fields | {"visible": average_seen(points, weight, seen, rules)}
+    table = jnp.concatenate([normal, points.color, one_sided[None], layer_spacing[None]])
+    fields = map_blocks(work, points, table, const, raw_spacing, layer, weight, normal, one_sided)
+    return fields | {"visibility": average_visibility(points, weight, visibility, const)}
 
 
-def average_seen(
-    points: Points, weight: Float[Array, "k points"], seen: Float[Array, "64 points"], rules: Rules = RULES
+def average_visibility(
+    points: PointColumns,
+    weight: Float[Array, "k points"],
+    visibility: Float[Array, "64 points"],
+    const: Constants = CONSTANTS,
 ) -> Float[Array, "64 points"]:
     """Visibility averaged over the nearest neighbors on the same layer: a depth buffer of points is noisy."""
-    size, rows, weight = min(rules.block, len(points.mask)), seen.T, jax.lax.stop_gradient(weight)
+    size, rows, weight = min(const.block_size, len(points.mask)), visibility.T, jax.lax.stop_gradient(weight)
 
     def one(block: tuple[Array, Array]) -> Array:
-        return discs.average(*block, rows)
+        return discs.average_rows(*block, rows)
 
-    near = _split(points.number[: rules.smoothed], size, -1), _split(weight[: rules.smoothed], size, 1)
-    return jax.lax.map(one, near).reshape(-1, len(seen))[: len(points.mask)].T
+    count = const.averaged_neighbors
+    near = _split(points.neighbors[:count], size, -1), _split(weight[:count], size, 1)
+    return jax.lax.map(one, near).reshape(-1, len(visibility))[: len(points.mask)].T
 
 
-def find_spacings(
-    points: Points,
-    raw: Float[Array, " points"],
+def measure_spacings(
+    points: PointColumns,
+    raw_spacing: Float[Array, " points"],
     layer: Layer,
     normal: Float[Array, "3 points"],
-    sided: Float[Array, " points"],
-    rules: Rules = RULES,
+    one_sided: Float[Array, " points"],
+    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, " points"], Float[Array, "k points"], Bool[Array, ""]]:
     """Spacings, weights of the neighbors as members of the same layer, and whether the points are random (not even)."""
 
     def weigh(
-        hood: Hood, number: Array, raw: Array, layer: Layer, normal: Array, sided: Array
+        hood: Neighborhood, raw_spacing: Array, layer: Layer, normal: Array, one_sided: Array
     ) -> tuple[Array, Array, Array]:
-        weight = layers.weigh_layer(hood, layer, normal, sided, hood.columns, rules)
-        spacing = discs.own_spacing(hood, weight, raw, rules)
+        weight = layers.weigh_layer(hood, layer, normal, one_sided, hood.columns, const)
+        spacing = discs.measure_layer_spacing(hood, weight, raw_spacing, const)
         return spacing, weight, discs.measure_evenness(*jax.lax.stop_gradient((hood, weight, spacing)))
 
-    rough, weight, evenness = map_blocks(weigh, points, normal, rules, raw, layer, normal, sided)
-    random = median(evenness, points.mask) < rules.even
-    return jnp.where(random, rough, jnp.minimum(rough, rules.most_even * raw)), weight, random
+    layer_spacing, weight, evenness = map_blocks(weigh, points, normal, const, raw_spacing, layer, normal, one_sided)
+    random = median(evenness, points.mask) < const.even_distance
+    bounded = jnp.minimum(layer_spacing, const.even_spacing_bound * raw_spacing)
+    return jnp.where(random, layer_spacing, bounded), weight, random
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -370,11 +398,11 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     scene's centre.  The docstring of `geometry.py` lists what has no gradient.
     """
     del params
-    inside, centre, scale = move_into_box(cloud)
-    return make_scene(inside, neighbors, centre, scale, RULES)
+    inside, centre, scale = normalise_cloud(cloud)
+    return make_scene(inside, neighbors, centre, scale, CONSTANTS)
 
 
-def move_into_box(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
+def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
     """The cloud normalised to the box [-1, 1]^3, and the centre and scale of this transform."""
     positions = jnp.asarray(cloud.positions)
     centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
@@ -399,9 +427,13 @@ def fit_box(
 
 
 def make_scene(
-    cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], centre: Array, scale: Array, rules: Rules
+    cloud: PointCloud,
+    neighbors: Int[AnyArray, "points 20"],
+    centre: Array,
+    scale: Array,
+    const: Constants,
 ) -> SurfelScene:
     """The scene of a cloud that is already in the box; centre and scale are those of its transform."""
-    surfels = estimate_surfels(cloud, jnp.asarray(neighbors), rules)
+    surfels = estimate_surfels(cloud, jnp.asarray(neighbors), const)
     spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.numerics import clamp, columns, larger, namespace, root, smaller
+from spnr_jax.kernels.numerics import array_namespace, clamp, larger, safe_sqrt, smaller, split_columns
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels.sides import DIRECTIONS
 
 # --- maps as arrays ---------------------------------------------------------------------------------------------------
 
 
-def directions(height: int) -> Float[np.ndarray, "height width 3"]:
+def texel_directions(height: int) -> Float[np.ndarray, "height width 3"]:
     """Unit directions through the centres of a map's texels."""
     theta = np.pi * (np.arange(height) + 0.5) / height
     phi = np.pi * (np.arange(2 * height) + 0.5) / height
@@ -42,17 +42,17 @@ def solid_angles(height: int) -> Float[np.ndarray, "height width"]:
 
 def resample(envmap: Float[AnyArray, "h w 3"], height: int) -> Float[AnyArray, "height width 3"]:
     """The map at another size: each texel is the mean, by solid angle, of those that it overlaps; energy is kept."""
-    rows = _shares(
+    rows = _overlap(
         -np.cos(np.pi * np.arange(envmap.shape[0] + 1) / envmap.shape[0]),
         -np.cos(np.pi * np.arange(height + 1) / height),
     )
-    columns = _shares(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
-    xp = namespace(envmap)
+    columns = _overlap(np.linspace(0, 1, envmap.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
+    xp = array_namespace(envmap)
     narrow = xp.tensordot(rows, envmap, axes=(1, 0))
     return xp.tensordot(narrow, columns, axes=(1, 1)).swapaxes(1, 2)
 
 
-def _shares(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _overlap(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Share of each old interval in each new one (new, old), from sorted edges."""
     overlap = np.minimum(old[1:], new[1:, None]) - np.maximum(old[:-1], new[:-1, None])
     return (np.maximum(overlap, 0) / (new[1:] - new[:-1])[:, None]).astype(np.float32)
@@ -76,7 +76,7 @@ ODD = (3, 4, 7), (1, 4, 5)  # indices of the harmonics that change sign when the
 @cache
 def _lobes() -> Float[np.ndarray, "tables texels texels"]:
     """Weights of the texels in each entry of the tables; the weights of a lobe add up to 1."""
-    towards, area = directions(HEIGHT).reshape(-1, 3).astype(np.float32), solid_angles(HEIGHT).reshape(-1)
+    towards, area = texel_directions(HEIGHT).reshape(-1, 3).astype(np.float32), solid_angles(HEIGHT).reshape(-1)
     cosine = np.maximum(towards @ towards.T, -1)
     lobes = [np.maximum(cosine, 0)]
     half = np.clip((1 + cosine) / 2, 0, 1)
@@ -89,7 +89,7 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
 
 def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
     """The light of a map of any size whose width is twice its height; energy is preserved.  The map may be traced."""
-    xp = namespace(envmap)
+    xp = array_namespace(envmap)
     small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
     tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
     return Light(tables=xp.concatenate([tables[:1], small[None], tables[1:]]))
@@ -107,11 +107,11 @@ def room_light() -> Light:
 
 def ambient(color: Color = (1, 1, 1)) -> Light:
     """The same radiance from all directions."""
-    xp = namespace(color)
+    xp = array_namespace(color)
     return light_of(xp.broadcast_to(xp.asarray(color, np.float32), (HEIGHT, WIDTH, 3)))
 
 
-def background(light: Light, towards: list[Array]) -> list[Array]:
+def look_up_background(light: Light, towards: list[Array]) -> list[Array]:
     """Radiance of the map at unit directions, colours as columns."""
     return look_up(jnp.asarray(light.tables[1]).reshape(-1, 3), towards)
 
@@ -122,7 +122,7 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     `first` is, for each direction, the row at which its table begins.
     """
     x, y, z = towards
-    across = root(x * x + z * z)
+    across = safe_sqrt(x * x + z * z)
     aside = across > POLE  # at the poles there is no azimuth, nor a gradient by it
     polar = jnp.arctan2(jnp.where(aside, across, 0), jnp.where(aside, y, jnp.where(y < 0, -1, 1)))
     azimuth = jnp.arctan2(jnp.where(aside, x, 0), jnp.where(aside, -z, 1))
@@ -135,7 +135,7 @@ def look_up(tables: Float[Array, "rows 3"], towards: list[Array], first: Array |
     corners = [
         (rows[i] + texels[j], (down if i else 1 - down) * (right if j else 1 - right)) for i in (0, 1) for j in (0, 1)
     ]
-    channels = columns(jnp.asarray(tables))
+    channels = split_columns(jnp.asarray(tables))
     return [reduce(add, (weight * channel[index] for index, weight in corners)) for channel in channels]
 
 
@@ -162,12 +162,12 @@ def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
     return two[0] - 1.04 * grazing, two[1] + 1.04 * grazing
 
 
-def arriving(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
+def gather_irradiance(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
     """Irradiance / pi of each surfel from the directions that it is visible from."""
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
     tables = jnp.asarray(light.tables)[1 + BLUR_LEVEL].reshape(-1, 3)
     radiance = jnp.stack(look_up(tables, [jnp.asarray(x) for x in DIRECTIONS.T]), axis=-1)
-    return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visible * cosines, radiance, precision="highest")
+    return (4 / len(DIRECTIONS)) * jnp.einsum("pd,dc->pc", surfels.visibility * cosines, radiance, precision="highest")
 
 
 def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
@@ -181,6 +181,6 @@ def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
 
 def project_harmonics(light: Light, rotation: Float[AnyArray, "3 3"]) -> Float[Array, "9 3"]:
     """Spherical harmonics of the map over pi, in camera axes (the columns of cam_to_world)."""
-    towards = jnp.asarray(directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
+    towards = jnp.asarray(texel_directions(HEIGHT).reshape(-1, 3), jnp.float32) @ rotation
     basis = jnp.stack(harmonics(*towards.T)) * jnp.asarray(solid_angles(HEIGHT).reshape(1, -1))
     return jnp.einsum("bt,tc->bc", basis, jnp.asarray(light.tables)[1].reshape(-1, 3), precision="highest") / jnp.pi

@@ -16,9 +16,9 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import geometry
-from spnr_jax.surfels.geometry import Points, order_in_space
+from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
-NEIGHBOURS = 16  # of a point, for the spacing
+NEIGHBORS = 16  # of a point, for the spacing
 REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance
 DISCS = 2.5  # times the points in a disc of that radius: number of neighbours
 MOST = 128  # neighbours at most
@@ -31,7 +31,7 @@ SAMPLE = 2048  # points at which the spacing is measured
 TINY = np.finfo(np.float64).tiny
 
 
-def planes(
+def estimate_normals(
     positions: Float[np.ndarray, "points 3"], among: Float[np.ndarray, "all 3"], noise: float = 0.0
 ) -> Float[np.ndarray, "points 3"]:
     """Unit normals, of either sign, at some points, from all points of their cloud (`among`).
@@ -40,12 +40,12 @@ def planes(
     previous plane, so that a point at an edge gets one of its faces (robust moving least squares, Fleishman et al.
     2005). `noise` is the standard deviation of the points before they were averaged: it enlarges the neighbourhood.
     """
-    return _planes(positions, cKDTree(among), noise)
+    return _estimate_normals(positions, cKDTree(among), noise)
 
 
-def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
-    """The normals of `planes`, from a k-d tree of all points."""
-    spacing = _spacing(tree)
+def _estimate_normals(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
+    """The normals of `estimate_normals`, from a k-d tree of all points."""
+    spacing = _measure_spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
     ranks = list(range(1, round(min(count, MOST, tree.n)) + 1))
@@ -55,37 +55,37 @@ def _planes(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
         offset = tree.data[near] - points[:, None]
         weight = close = np.exp(-0.5 * (distance / max(radius, TINY)) ** 2)
         for _ in range(ROUNDS):
-            height = np.einsum("nki,ni->nk", offset, _narrowest(offset, weight))
+            height = np.einsum("nki,ni->nk", offset, _find_narrowest(offset, weight))
             weight = close * np.exp(-0.5 * (height / max(thick, TINY)) ** 2)
-        return _narrowest(offset, weight)
+        return _find_narrowest(offset, weight)
 
     return np.concatenate([of_rows(positions[i : i + ROWS]) for i in range(0, len(positions), ROWS)])
 
 
-def _narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _find_narrowest(offset: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Unit vectors (n, 3) of least variance of weighted neighbours (n, k, 3)."""
     share = weight / weight.sum(axis=1, keepdims=True)
     centred = offset - (share[:, None] @ offset)
     return np.linalg.eigh(np.swapaxes(centred * share[..., None], 1, 2) @ centred)[1][..., 0]
 
 
-def facing(
+def face_sensor(
     positions: Float[np.ndarray, "points 3"],
     among: Float[np.ndarray, "all 3"],
-    place: Float[np.ndarray, "3"],
+    sensor: Float[np.ndarray, "3"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """The normals of `planes`, turned to the position of the sensor that saw the points.
+    """The normals of `estimate_normals`, turned to the position of the sensor that saw the points.
 
     One sensor sees only one side of each surface, so all heights above the planes count as noise, depth steps included.
     """
     tree = cKDTree(among)
-    normals = _planes(positions, tree, max(noise, ROUGH * _thickness(tree)))
-    towards = np.einsum("ni,ni->n", normals, place - positions)
+    normals = _estimate_normals(positions, tree, max(noise, ROUGH * _measure_thickness(tree)))
+    towards = np.einsum("ni,ni->n", normals, sensor - positions)
     return np.where(towards[:, None] < 0, -normals, normals)
 
 
-def _thickness(tree: cKDTree) -> float:
+def _measure_thickness(tree: cKDTree) -> float:
     """Median thickness of a sample of neighbourhoods about their least-squares planes."""
     sample = tree.data[:: -(-tree.n // SAMPLE)]
     near = tree.data[tree.query(sample, list(range(1, min(FLAT, tree.n) + 1)), workers=-1)[1]]
@@ -94,41 +94,37 @@ def _thickness(tree: cKDTree) -> float:
 
 
 def find_visible(
-    positions: Float[np.ndarray, "points 3"], place: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
+    positions: Float[np.ndarray, "points 3"], sensor: Float[np.ndarray, "3"], spacing: float | int, behind: float | int
 ) -> Bool[np.ndarray, " points"]:
-    """True for points visible from the place: the first in each pixel, and others up to `behind` spacings behind it.
+    """True for points visible from the sensor: the first in each pixel, and others up to `behind` spacings behind it.
 
     The sensor looks at the middle of the points; its pixels are CELL spacings wide there.
     """
-    way = positions.mean(axis=0) - place
-    distance = float(np.linalg.norm(way))
+    towards = positions.mean(axis=0) - sensor
+    distance = float(np.linalg.norm(towards))
     if not distance > 0 or not spacing > 0:
         return np.zeros(len(positions), bool)
-    forward = way / distance
+    forward = towards / distance
     right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right /= np.linalg.norm(right)
-    x, y, depth = np.stack([right, np.cross(right, forward), forward]) @ (positions - place).T
+    x, y, depth = np.stack([right, np.cross(right, forward), forward]) @ (positions - sensor).T
     before = np.flatnonzero(depth > spacing)
     pixels = np.floor(np.stack([x, y])[:, before] / depth[before] * (distance / (CELL * spacing)))
     _, rows = np.unique(pixels, axis=1, return_inverse=True)
     first = np.full(len(before), np.inf)
     np.minimum.at(first, rows.ravel(), depth[before])
-    seen = np.zeros(len(positions), bool)
-    seen[before] = depth[before] < first[rows.ravel()] + behind * spacing
-    return seen
+    visibility = np.zeros(len(positions), bool)
+    visibility[before] = depth[before] < first[rows.ravel()] + behind * spacing
+    return visibility
 
 
-def spacing_of(positions: Float[np.ndarray, "points 3"]) -> float:
-    """Median side of the square that a point represents, from a sample of the points; 0 for fewer than two points."""
-    return _spacing(cKDTree(positions))
+def measure_spacing(positions: Float[np.ndarray, "points 3"]) -> float:
+    """Median side of the square that a point represents, from 16 neighbours; 0 for fewer than two points."""
+    return _measure_spacing(cKDTree(positions))
 
 
-def _spacing(tree: cKDTree) -> float:
-    if tree.n < 2:
-        return 0.0
-    count = min(NEIGHBOURS, tree.n)
-    radius = tree.query(tree.data[:: -(-tree.n // SAMPLE)], [count], workers=-1)[0]
-    return float(np.median(radius)) * float(np.sqrt(np.pi / count))
+def _measure_spacing(tree: cKDTree) -> float:
+    return 0.0 if tree.n < 2 else cloud_arrays.measure_spacing(tree, min(NEIGHBORS, tree.n), SAMPLE)
 
 
 # --- thinned clouds ---------------------------------------------------------------------------------------------------
@@ -156,39 +152,39 @@ def outward_normals(
     kept: Int[np.ndarray, " points"],
     noise: float = 0.0,
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals of the points with these indices, outward by the votes of directions and walls (sides.py).
+    """Unit normals of the points with these indices, outward by the votes of directions and thin walls (sides.py).
 
-    Linear colors separate sheets that nearly touch; `noise` is that of `planes`.
+    Linear colors split surfaces that nearly touch; `noise` is that of `estimate_normals`.
     """
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
     voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
     low, high = positions.min(axis=0), positions.max(axis=0)
     half = np.linalg.norm(high - low) / 2 or 1.0
-    places = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
-    order, near = order_in_space(places)
+    in_box = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
+    order, near = order_in_space(in_box)
     size = cloud_arrays.bucket(len(order))
 
     def columns(values: np.ndarray, fill: int = 0) -> Array:
         return jnp.asarray(np.pad(values.T, [(0, 0), (0, size - len(order))], constant_values=fill))
 
     color = np.asarray(base_color[voters], np.float32)
-    normal = np.asarray(planes(positions[voters], positions, noise), np.float32)
-    points = Points(
-        number=columns(near, -1),
+    normal = np.asarray(estimate_normals(positions[voters], positions, noise), np.float32)
+    points = PointColumns(
+        neighbors=columns(near, -1),
         mask=jnp.arange(size) < len(order),
-        given=jnp.zeros(size, bool),  # whether the given normal is oriented
-        position=columns(places[order]),
+        oriented=jnp.zeros(size, bool),  # whether the given normal is oriented
+        position=columns(in_box[order]),
         color=columns(color[order]),
     )
-    found = np.empty_like(places)
-    found[order] = np.asarray(_turn(points, columns(normal[order])))[:, : len(order)].T
+    found = np.empty_like(in_box)
+    found[order] = np.asarray(_orient(points, columns(normal[order])))[:, : len(order)].T
     return found[: len(kept)]
 
 
 @partial(jax.jit, compiler_options=QUICKEST)
-def _turn(points: Points, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
-    """The given normals turned outward; those of two-sided sheets are kept."""
-    raw, layer = geometry.find_layers(points, normals, sided=False, sheets=True)
-    seen = geometry.estimate_visibility(points, layer.normal, raw)
-    return geometry.find_sides(points, raw, layer, seen)[0]
+def _orient(points: PointColumns, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
+    """The given normals turned outward; two-sided ones are kept."""
+    raw_spacing, layer = geometry.find_layers(points, normals, oriented=False, split_by_color=True)
+    visibility = geometry.estimate_visibility(points, layer.normal, raw_spacing)
+    return geometry.orient_layers(points, raw_spacing, layer, visibility)[0]

@@ -1,12 +1,12 @@
-"""Which side of a surface is outside: visibility from fixed directions, votes of these and of opposite walls.
+"""Which side of a surface is outside: visibility from fixed directions, votes of these and of thin walls.
 
 For each of 64 directions, the points are drawn into an orthographic depth buffer whose cells are CELL spacings wide:
 each point into the four cells around it, at the depth of its plane at the cell's centre.  A point is visible if, lifted
 off the surface by one spacing, it lies in front of the buffer.  Both depths are taken at the cell's centre, so a plane
 does not hide itself at any angle.  Visibility also gives ambient occlusion and the share of light that arrives.
 
-Votes are pure functions of a block of points, the last axis.  A *lean* is a signed vote: positive if the normal points
-outward.  Votes flip a normal or keep it, and have no gradient.
+Votes are pure functions of a block of points, the last axis.  A vote is positive if the normal points outward.  Votes
+flip a normal or keep it, and have no gradient.
 """
 
 import jax
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from spnr_jax.kernels.numerics import clamp, dot, total
-from spnr_jax.surfels.layers import Hood, Layer, Rules, along, weigh_height, weigh_near
+from spnr_jax.kernels.numerics import clamp, dot, sum_first
+from spnr_jax.surfels.layers import Constants, Layer, Neighborhood, project_on, weigh_distance, weigh_height
 
 # --- visibility -------------------------------------------------------------------------------------------------------
 
@@ -23,8 +23,8 @@ from spnr_jax.surfels.layers import Hood, Layer, Rules, along, weigh_height, wei
 NUM_DIRECTIONS = 64
 CELL = 1.5  # width of a cell, in spacings
 STEEPEST = 8.0  # largest slope of a plane relative to the direction
-REACH = 1.6  # radius of a disc, in spacings: in cells beyond it, a point counts at its own depth
-SOFT = 1.0  # spacings behind the depth buffer over which visibility falls to 0
+DISC_RADIUS = 1.6  # radius of a disc, in spacings: in cells beyond it, a point counts at its own depth
+SOFTNESS = 1.0  # spacings behind the depth buffer over which visibility falls to 0
 COARSEST, FINEST = 256, 1024  # least and largest number of cells along a side
 BOX = 2.2  # side of the square that each buffer covers: the box's diagonal is 2
 
@@ -51,17 +51,17 @@ def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"
 DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
-def grid_of(count: int) -> int:
+def choose_grid(count: int) -> int:
     """Cells along a side of the depth buffers for so many points: CELL spacings wide, if that covers the box."""
     return int(min(max(16 * -(-(4 * count**0.5) // 16), COARSEST), FINEST))
 
 
-def cell_of(spacing: Float[Array, ""], grid: int) -> Float[Array, ""]:
+def choose_cell(spacing: Float[Array, ""], grid: int) -> Float[Array, ""]:
     """Width of a cell, from the median spacing."""
     return jnp.maximum(CELL * spacing, BOX / grid)
 
 
-def see_directions(
+def compute_visibility(
     positions: Float[Array, "3 points"],
     normals: Float[Array, "3 points"],
     spacing: Float[Array, " points"],
@@ -93,7 +93,7 @@ def see_directions(
         across, high = (dot(axis, positions) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
         depth = dot(towards, positions)
-        most = REACH * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
+        most = DISC_RADIUS * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
         nearest = jnp.full(grid * grid, -2 * BOX, depth.dtype)
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
             nearer = beside(column + i, row + j, across, high, steep)
@@ -105,7 +105,7 @@ def see_directions(
         column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
         there = dot(towards, lifted) + beside(column, row, across, high, steep)
         behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
-        return jnp.clip(1 - behind / SOFT, 0, 1)
+        return jnp.clip(1 - behind / SOFTNESS, 0, 1)
 
     axes = (jnp.asarray(axis, positions.dtype) for axis in (DIRECTIONS, *tangents(DIRECTIONS)))
     return jax.lax.map(look, tuple(axes))
@@ -114,8 +114,8 @@ def see_directions(
 # --- votes ------------------------------------------------------------------------------------------------------------
 
 
-def count_facing(
-    normal: Float[Array, "3 points"], seen: Float[Array, "64 points"]
+def sum_visibility(
+    normal: Float[Array, "3 points"], visibility: Float[Array, "64 points"]
 ) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
     """Visibility summed over directions in front of each point, weighted by the cosine with its normal; and behind."""
 
@@ -124,56 +124,57 @@ def count_facing(
         return (sums[0] + jnp.maximum(counted, 0), sums[1] - jnp.minimum(counted, 0)), None
 
     zeros = jnp.zeros_like(normal[0])
-    return jax.lax.scan(add, (zeros, zeros), (jnp.asarray(DIRECTIONS, normal.dtype), seen))[0]
+    return jax.lax.scan(add, (zeros, zeros), (jnp.asarray(DIRECTIONS, normal.dtype), visibility))[0]
 
 
-def share_votes(
-    hood: Hood,
+def average_votes(
+    hood: Neighborhood,
     layer: Layer,
     spacing: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
-    leans: Float[Array, "k block"],
-    rules: Rules,
+    votes: Float[Array, "k block"],
+    const: Constants,
 ) -> Float[Array, " block"]:
-    """Mean lean of each point and its neighbors on the same layer; opposite normals count with the opposite sign."""
-    cosine = along(normals, layer.normal)
-    weight = weigh_near(hood, spacing, rules) * weigh_height(layer) * cosine**2
-    return total(weight * jnp.sign(cosine) * leans) / jnp.maximum(total(weight), 1e-6)
+    """Mean vote of each point and its neighbors on the same layer; opposite normals count with the opposite sign."""
+    cosine = project_on(normals, layer.normal)
+    weight = weigh_distance(hood, spacing, const) * weigh_height(layer) * cosine**2
+    return sum_first(weight * jnp.sign(cosine) * votes) / jnp.maximum(sum_first(weight), 1e-6)
 
 
-def vote_of_walls(
-    hood: Hood,
+def vote_by_thin_walls(
+    hood: Neighborhood,
     layer: Layer,
     spacing: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
-    given: Bool[Array, " block"],
-    rules: Rules,
+    oriented: Bool[Array, " block"],
+    const: Constants,
 ) -> Float[Array, " block"]:
-    """A lean from a parallel layer too close to be visible in between: the sides of a wall face away from each other.
+    """The vote of a parallel layer just behind: the two sides of a thin wall face away from each other.
 
-    A layer just below another, as under a sticker, is taken for a wall's inner side; given normals tell them apart.
+    A layer just below another, as under a sticker, is taken for a thin wall's inner side; given normals tell them
+    apart.
     """
-    cosine = along(normals, layer.normal)
-    other = jnp.where(given[None], -cosine, jnp.abs(cosine)) > rules.parallel
-    wall = weigh_near(hood, spacing, rules) * other * (jnp.abs(layer.height) < rules.wall)
-    thin = given & (layer.scale <= rules.scales[0])
-    scale = jnp.where(thin, rules.sheet_scale, layer.scale)
-    outward = layer.height / scale[None]
-    above, below = total(wall * (outward > rules.apart)), total(wall * (outward < -rules.apart))
-    return rules.wall_vote * (below - above) / (above + below + rules.evidence)
+    cosine = project_on(normals, layer.normal)
+    other = jnp.where(oriented[None], -cosine, jnp.abs(cosine)) > const.parallel_cosine
+    wall = weigh_distance(hood, spacing, const) * other * (jnp.abs(layer.height) < const.thin_wall_height)
+    thin = oriented & (layer.thickness <= const.thickness_bounds[0])
+    thickness = jnp.where(thin, const.split_thickness, layer.thickness)
+    outward = layer.height / thickness[None]
+    above, below = sum_first(wall * (outward > const.other_layer)), sum_first(wall * (outward < -const.other_layer))
+    return const.thin_wall_weight * (below - above) / (above + below + const.vote_ridge)
 
 
-def turn_outward(
+def orient_normals(
     normal: Float[Array, "3 block"],
-    towards: Float[Array, " block"],
-    given: Bool[Array, " block"],
-    rules: Rules,
+    vote: Float[Array, " block"],
+    oriented: Bool[Array, " block"],
+    const: Constants,
 ) -> tuple[Float[Array, "3 block"], Float[Array, " block"]]:
-    """Normals that point outward, and `sided`: near 1 where the votes decide which side that is, 0 where they do not.
+    """Normals that point outward, and `one_sided`: near 1 where the votes decide which side that is, else 0.
 
     Given normals are oriented; they are flipped only where the votes are clear.
     """
-    begin, end = rules.sure_side
-    sided = clamp((jnp.abs(towards) - begin) / (end - begin), 0, 1 - rules.leak)
-    wrong = towards < jnp.where(given, -rules.turn, 0)
-    return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(sided)
+    begin, end = const.orientation_ramp
+    one_sided = clamp((jnp.abs(vote) - begin) / (end - begin), 0, 1 - const.back_weight)
+    wrong = vote < jnp.where(oriented, -const.flip_vote, 0)
+    return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(one_sided)

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from spnr_jax.kernels.numerics import namespace
+from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, Light
-from spnr_jax.surfels.lighting import Color, directions, light_of, solid_angles
+from spnr_jax.surfels.lighting import Color, light_of, solid_angles, texel_directions
 
 # --- the room ---------------------------------------------------------------------------------------------------------
 
@@ -42,7 +42,7 @@ FURNITURE = (
 
 def indoor_envmap(height: int = 128) -> np.ndarray:
     """Return the default map (height, 2 * height, 3): a furnished room with a window and lamps, unscaled."""
-    fine = room_radiance(directions(2 * height))
+    fine = room_radiance(texel_directions(2 * height))
     return fine.reshape(height, 2, 2 * height, 2, 3).mean(axis=(1, 3)).astype(np.float32)
 
 
@@ -87,9 +87,9 @@ def irradiance(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
             for b in steps:
                 spot = np.array(centre, float)
                 spot[sides] += a * half[sides[0]], b * half[sides[1]]
-                towards = spot - positions
-                squared = (towards**2).sum(-1) + 0.05  # softened: a wall may touch the lamp
-                cosines = np.maximum((towards * normals).sum(-1), 0) * np.maximum(-(towards @ np.asarray(normal)), 0)
+                to_lamp = spot - positions
+                squared = (to_lamp**2).sum(-1) + 0.05  # softened: a wall may touch the lamp
+                cosines = np.maximum((to_lamp * normals).sum(-1), 0) * np.maximum(-(to_lamp @ np.asarray(normal)), 0)
                 total += (cosines / squared**2 * area / 4)[..., None] * np.asarray(emitted)
     return total
 
@@ -113,16 +113,16 @@ Angle = float | int | np.floating | jax.Array  # degrees
 Map = Float[AnyArray, "height width 3"]
 
 
-def towards(azimuth: Angle, elevation: Angle) -> Float[AnyArray, "3"]:
+def direction_from_angles(azimuth: Angle, elevation: Angle) -> Float[AnyArray, "3"]:
     """Unit direction from angles in degrees: azimuth 0 is +z, 90 is +x; elevation 90 is straight up (+y)."""
-    xp = namespace(azimuth, elevation)
+    xp = array_namespace(azimuth, elevation)
     turn, rise = xp.radians(azimuth), xp.radians(elevation)
     return xp.stack([xp.cos(rise) * xp.sin(turn), xp.sin(rise), xp.cos(rise) * xp.cos(turn)])
 
 
 def gradient(zenith: Color, horizon: Color, ground: Color, height: int = HEIGHT) -> Map:
     """A sky with a gradient from the horizon to the zenith, and a floor of one colour."""
-    sine = directions(height)[..., 1:2]
+    sine = texel_directions(height)[..., 1:2]
     sky = np.asarray(horizon) + (np.asarray(zenith) - np.asarray(horizon)) * np.clip(sine, 0, 1) ** 0.7
     up = np.clip(0.5 + 0.5 * sine / HORIZON, 0, 1)
     return (np.asarray(ground) * (1 - up) + sky * up).astype(np.float32)
@@ -133,14 +133,14 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
 
     Its edge fades over a quarter of its radius.
     """
-    xp = namespace(azimuth, elevation, size, irradiance)
+    xp = array_namespace(azimuth, elevation, size, irradiance)
     radius = xp.radians(xp.maximum(size / 2, 180 / height))
-    cosine = xp.clip(directions(height) @ towards(azimuth, elevation), -MIDDLE, MIDDLE)
+    cosine = xp.clip(texel_directions(height) @ direction_from_angles(azimuth, elevation), -MIDDLE, MIDDLE)
     angle = xp.arccos(cosine)  # never 0, where arccos has no gradient
     ramp = xp.clip((1.125 - angle / radius) * 4, 0, 1)
     disc = ramp * ramp * (3 - 2 * ramp)
-    held = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
-    return (disc[..., None] * xp.asarray(irradiance)[None, None] / held).astype(np.float32)
+    received = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
+    return (disc[..., None] * xp.asarray(irradiance)[None, None] / received).astype(np.float32)
 
 
 def sun(azimuth: Angle, elevation: Angle, size: Angle = 3.0, color: Color = (1, 1, 1)) -> Light:
@@ -188,16 +188,16 @@ NAMED: dict[str, Callable[[int], Map]] = {
 def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
     """A sky of random colours with up to MOST_LAMPS lamps, from broad glows to suns of three degrees."""
 
-    def colour(brightness: float, tint: float) -> np.ndarray:
+    def random_color(brightness: float, tint: float) -> np.ndarray:
         return brightness * np.exp(tint * generator.standard_normal(3))
 
     above, around, below = np.exp(generator.normal(-1, 0.7, 3))
-    whole = gradient(colour(above, 0.3), colour(around, 0.3), colour(below, 0.3), height)
+    whole = gradient(random_color(above, 0.3), random_color(around, 0.3), random_color(below, 0.3), height)
     for _ in range(generator.integers(0, MOST_LAMPS + 1)):
         rise = np.degrees(np.arcsin(generator.uniform(-0.4, 1)))
         size = np.exp(generator.uniform(np.log(3), np.log(90)))
         power = np.exp(generator.normal(-0.3, 0.7))
-        whole = whole + lamp(generator.uniform(0, 360), rise, size, colour(power, 0.2), height)
+        whole = whole + lamp(generator.uniform(0, 360), rise, size, random_color(power, 0.2), height)
     return whole
 
 

@@ -1,15 +1,16 @@
 """Surfels splatted to a G-buffer: the pixels that discs cover, and their order-independent blending by layers.
 
-    entry       a pair of a disc and a pixel that it covers; entries are counted, created, and sorted by pixel and depth
-    kernel      1 - r^2, r being the distance from the disc's centre in its plane, over RADIUS spacings; a disc viewed
-                edge-on or smaller than a pixel has a radius of FLOOR pixels (low-pass filter of EWA splatting, Zwicker
-                et al. 2001); an entry's optical depth is proportional to the square of the kernel
-    layers      of a pixel's LIST front-most entries, those less than a spacing apart in depth blend and do not occlude
-                each other; from two spacings on, the front entry occludes the one behind
-    share       blend weight of an entry in its pixel: the shares of a layer add up to 1 - exp(-optical depth), times
-                the transmittance before it; over all layers they add up to the opacity
+    entry         a pair of a disc and a pixel that it covers (gsplat: intersection); entries are counted, made, and
+                  sorted by pixel and depth
+    kernel        1 - r^2, where r is the distance from the disc's centre in its plane, over RADIUS spacings; a disc
+                  viewed edge-on or smaller than a pixel has a radius of MIN_RADIUS pixels (low-pass filter of EWA
+                  splatting, Zwicker et al. 2001); an entry's optical depth is proportional to the square of the kernel
+    layers        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
+                  occlude each other; from two spacings on, the front entry occludes the one behind
+    blend weight  of an entry in its pixel: the weights of a layer add up to 1 - exp(-optical depth), times the
+                  transmittance before it; over all layers they add up to the opacity
 
-Weights fall to 0 at the rim of a disc, so a picture is continuous in the camera and in the points.  The pixels that a
+Kernels fall to 0 at the rim of a disc, so a picture is continuous in the camera and in the points.  The pixels that a
 disc covers, and the order of the entries, are integers without a gradient.  Sizes are static; entries that do not fit
 are counted.
 """
@@ -26,22 +27,22 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
-from spnr_jax.kernels.numerics import clamp, columns, larger, one_minus_exp, root, smaller, smoothstep
+from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep, split_columns
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 # --- entries ----------------------------------------------------------------------------------------------------------
 
 
 RADIUS = 1.6  # of a disc, in spacings
-FLOOR = 1.0  # smallest radius of a disc in the picture, in pixels
+MIN_RADIUS = 1.0  # smallest radius of a disc in the picture, in pixels
 RIM_WIDTH = 0.4  # spacings over which a disc fades out at the end of its layer
-SKIRT = 0.15  # share of the kernel kept beyond the end of a layer, from which the network can correct that end
-EDGE = 0.02  # least cosine between ray and normal: smaller ones are replaced by it
-NEAREST = 0.05  # near plane: least distance from the camera at which discs are drawn
+RIM_SKIRT = 0.15  # share of the kernel kept beyond the end of a layer, from which the network can correct that end
+LEAST_COSINE = 0.02  # least cosine between ray and normal: smaller ones are replaced by it
+NEAR_PLANE = 0.05  # near plane: least distance from the camera at which discs are drawn
 DEPTH_BITS, ENTRY_BITS = 19, 24  # at most, of the 64 bits of a sort key; the bits above hold the pixel
 PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # if the depth has all its bits
 MOST_ENTRIES = 2**ENTRY_BITS
-MOST = 2**30  # largest count: sums of int32 overflow beyond twice that
+MOST_COUNTED = 2**30  # largest count: sums of int32 overflow beyond twice that
 
 
 class Footprints(NamedTuple):
@@ -83,7 +84,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
 
 
-def footprints(surfels: Surfels, camera: Camera) -> Footprints:
+def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
     """Discs projected to a camera; back faces and discs behind the camera or outside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     x, y, z = (
@@ -95,15 +96,15 @@ def footprints(surfels: Surfels, camera: Camera) -> Footprints:
         )
     )
     normal = numerics.rotate_columns(rotation, surfels.normal)
-    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(root(x * x + y * y + z * z), NEAREST)
-    facing = 1 - jnp.asarray(surfels.sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
-    ahead = larger(-z, NEAREST)
+    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(safe_sqrt(x * x + y * y + z * z), NEAR_PLANE)
+    facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
+    ahead = larger(-z, NEAR_PLANE)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]
     radius = RADIUS * jnp.asarray(surfels.spacing)
     known = jax.lax.stop_gradient((camera.intrinsics, (x, y, z), normal, radius, (column, row)))
     left, top, width, height = _rectangles(*known, (camera.width, camera.height))
-    drawn = surfels.mask & (facing > 0) & (-z > NEAREST)
+    drawn = surfels.mask & (facing > 0) & (-z > NEAR_PLANE)
     return Footprints(
         centre=(x, y, z),
         normal=normal,
@@ -128,8 +129,8 @@ def _rectangles(
 ) -> tuple[Array, Array, Array, Array]:
     """First column and row, width and height of each disc's bounding rectangle in the picture; width 0 outside it."""
     x, y, z = centre
-    ahead = jnp.maximum(-z, NEAREST)
-    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAREST)  # of the disc
+    ahead = jnp.maximum(-z, NEAR_PLANE)
+    nearest = jnp.maximum(ahead - radius * jnp.sqrt(jnp.clip(1 - normal[2] ** 2, 0, 1)), NEAR_PLANE)  # of the disc
     sides = []
     for middle, focal, aside, along, most in (
         (place[0], intrinsics[0, 0], x / ahead, normal[0], size[0]),
@@ -137,7 +138,7 @@ def _rectangles(
     ):
         # a point of the disc at (dx, dz) from its centre projects focal * (dx + aside * dz) / (ahead - dz) beside it
         extent = jnp.sqrt(jnp.maximum(1 + aside**2 - (along + aside * normal[2]) ** 2, 0))
-        half = jnp.maximum(focal * radius * extent / nearest, FLOOR)
+        half = jnp.maximum(focal * radius * extent / nearest, MIN_RADIUS)
         first = jnp.clip(jnp.ceil(middle - half - 0.5), 0, most)
         sides.append((first, jnp.maximum(jnp.clip(jnp.floor(middle + half - 0.5) + 1, 0, most) - first, 0)))
     (left, width), (top, height) = ([x.astype(jnp.int32) for x in side] for side in sides)
@@ -146,7 +147,7 @@ def _rectangles(
 
 def count_entries(covered: Int[Array, " points"]) -> Int[Array, ""]:
     """Sum of the pixels that discs cover, at most MOST."""
-    return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST).astype(jnp.int32)
+    return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST_COUNTED).astype(jnp.int32)
 
 
 def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
@@ -161,55 +162,55 @@ def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
     return jnp.sum(inside > 0, dtype=jnp.int32)
 
 
-def entries(surfels: Surfels, camera: Camera, *, room: int) -> tuple[Entries, Int[Array, ""]]:
-    """The sorted entries of a picture, padded to `room`, and the number of those that did not fit.
+def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[Entries, Int[Array, ""]]:
+    """The sorted entries of a picture, padded to `capacity`, and the number of those that did not fit.
 
     Discs that do not fit are left out as a whole, the last surfels first.
     """
-    foot = footprints(surfels, camera)
+    foot = project_discs(surfels, camera)
     end = jnp.cumsum(foot.covered.astype(jnp.float32))  # exact up to 2**24, and does not overflow as int32 would
-    covered = jnp.where(end <= room, foot.covered, 0)
-    lost = count_entries(jnp.where(end <= room, 0, foot.covered))
+    covered = jnp.where(end <= capacity, foot.covered, 0)
+    lost = count_entries(jnp.where(end <= capacity, 0, foot.covered))
     end = jnp.cumsum(covered)
-    point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=room)
+    point = jnp.repeat(jnp.arange(len(covered), dtype=jnp.int32), covered, total_repeat_length=capacity)
     # gather whole columns once instead of at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
-    rim = numerics.rotate_columns(rotation, surfels.rim)
+    rim = numerics.rotate_columns(rotation, surfels.rim_tangent)
     side = _cross(foot.normal, rim)
-    reach = tuple(columns(jnp.asarray(surfels.reach)))
-    foot, begin, point, rim, side, reach = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, reach))
+    far = tuple(split_columns(jnp.asarray(surfels.rim_distances)))
+    foot, begin, point, rim, side, far = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, far))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
     radius = foot.radius[point]
-    place = jnp.arange(room, dtype=jnp.int32)
-    inside, width = place - begin[point], foot.width[point]
+    index = jnp.arange(capacity, dtype=jnp.int32)
+    inside, width = index - begin[point], foot.width[point]
     row = inside // width
     column = foot.left[point] + inside - row * width
     row = foot.top[point] + row
     right = (column + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
     up = -(row + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
     slope = nx * right + ny * up - nz
-    slope = jnp.where(slope < 0, smaller(slope, -EDGE), larger(slope, EDGE))
-    met = clamp((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
-    there = [RADIUS / radius * x for x in (met * right - x, met * up - y, -met - z)]  # in spacings
+    slope = jnp.where(slope < 0, smaller(slope, -LEAST_COSINE), larger(slope, LEAST_COSINE))
+    ray_depth = clamp((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
+    there = [RADIUS / radius * x for x in (ray_depth * right - x, ray_depth * up - y, -ray_depth - z)]  # in spacings
     in_plane = _dot(there, there) / RADIUS**2
     along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
-    ends = [r[point] - x for r, x in zip(reach, (along, -along, across, -across), strict=True)]
+    ends = [r[point] - x for r, x in zip(far, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
-    on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / FLOOR**2
-    cut = larger(cut - in_plane, SKIRT * (1 - in_plane))
+    on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / MIN_RADIUS**2
+    cut = larger(cut - in_plane, RIM_SKIRT * (1 - in_plane))
     kernel = clamp(larger(cut, 1 - on_picture), 0, 1)
-    depth = clamp(met, -z - radius, -z + radius)
+    depth = clamp(ray_depth, -z - radius, -z + radius)
     pixels = camera.height * camera.width
-    pixel = jnp.where((place < end[-1]) & (kernel > 0), row * camera.width + column, pixels)
-    order, pixel = _sort_entries(pixel, jax.lax.stop_gradient(depth), place, max(PIXEL_BITS, pixels.bit_length()))
+    pixel = jnp.where((index < end[-1]) & (kernel > 0), row * camera.width + column, pixels)
+    order, pixel = _sort_entries(pixel, jax.lax.stop_gradient(depth), index, max(PIXEL_BITS, pixels.bit_length()))
     first = jnp.concatenate([jnp.ones(1, bool), pixel[1:] != pixel[:-1]]) & (pixel < pixels)
     slot = jnp.cumsum(first.astype(jnp.int32)) - 1
-    rank = place - jax.lax.cummax(jnp.where(first, place, 0))
+    rank = index - jax.lax.cummax(jnp.where(first, index, 0))
     return Entries(point, kernel, depth, foot.facing[point], order, pixel, slot, rank), lost
 
 
 def _sort_entries(
-    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], place: Int[Array, " entries"], pixel_bits: int
+    pixel: Int[Array, " entries"], depth: Float[Array, " entries"], index: Int[Array, " entries"], pixel_bits: int
 ) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
     """Order and pixels of the entries by pixel and depth: one 64-bit key sorts nine times faster than three arrays."""
     low, high = jnp.min(depth), jnp.max(depth)
@@ -217,7 +218,7 @@ def _sort_entries(
     steps = 2**depth_bits - 1
     with jax.enable_x64(True):
         level = (steps * (depth - low) / jnp.maximum(high - low, 1e-6)).astype(jnp.uint64)
-        key = pixel.astype(jnp.uint64) << (depth_bits + ENTRY_BITS) | level << ENTRY_BITS | place.astype(jnp.uint64)
+        key = pixel.astype(jnp.uint64) << (depth_bits + ENTRY_BITS) | level << ENTRY_BITS | index.astype(jnp.uint64)
         key = jax.lax.sort(key)
         return (key & (2**ENTRY_BITS - 1)).astype(jnp.int32), (key >> (depth_bits + ENTRY_BITS)).astype(jnp.int32)
 
@@ -225,56 +226,56 @@ def _sort_entries(
 # --- blending ---------------------------------------------------------------------------------------------------------
 
 
-OPACITY = 3.0  # optical depth at the centre of a disc
-LIST = 24  # largest number of entries of a pixel
-NEAR = 8  # entries before and after an entry in the list that are compared in depth; those farther in front occlude it
-THIN = 0.03  # optical depth of a layer below which its mean transmittance is a series
-LEAST_SHARE = 1e-4  # least summed share that means are divided by
-SHARP = 4  # power of the kernel for the narrower weights that colours are blended with
+CENTRE_TAU = 3.0  # optical depth at the centre of a disc
+LIST_LENGTH = 24  # largest number of entries of a pixel
+COMPARED = 8  # entries on each side in the list that are compared in depth; those farther in front occlude
+THIN_TAU = 0.03  # optical depth of a layer below which its mean transmittance is a series
+LEAST_OPACITY = 1e-4  # least summed blend weight that means are divided by
+SHARP_POWER = 4  # power of the kernel for the narrower weights that colours are blended with
 LEAST_WEIGHT = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
-FAR = 1e-4  # summed narrow weights below which the distances of the centres fade to 0
+FADE = 1e-4  # summed narrow weights below which the distances of the centres fade to 0
 
 
 def blend(
-    found: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
+    entries: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
 ) -> GBuffer:
     """The G-buffer from the entries of a picture, for its first `slots` covered pixels (`count_covered_pixels`)."""
     height, width = camera.height, camera.width
-    table, pixel_of = _lists(found, slots, height * width)
+    table, pixel_of = _build_lists(entries, slots, height * width)
     listed = table >= 0
     table = jnp.maximum(table, 0)
-    point = jax.lax.optimization_barrier(found.point[table])
-    kernel = jnp.where(listed, found.kernel[table], 0)
-    weight = kernel**2 * found.facing[table]
-    depth, spacing = found.depth[table], jnp.asarray(surfels.spacing)[point]
+    point = jax.lax.optimization_barrier(entries.point[table])
+    kernel = jnp.where(listed, entries.kernel[table], 0)
+    weight = kernel**2 * entries.facing[table]
+    depth, spacing = entries.depth[table], jnp.asarray(surfels.spacing)[point]
     weight, depth, spacing = jax.lax.optimization_barrier((weight, depth, spacing))
-    share, left = shares(OPACITY * weight, depth, spacing)
-    sharp = share * kernel**SHARP * found.facing[table]
-    share, sharp = jax.lax.optimization_barrier((share, sharp))
+    blend_weight, transmittance = compute_blend_weights(CENTRE_TAU * weight, depth, spacing)
+    sharp_weight = blend_weight * kernel**SHARP_POWER * entries.facing[table]
+    blend_weight, sharp_weight = jax.lax.optimization_barrier((blend_weight, sharp_weight))
     rotation = camera.cam_to_world[:, :3]
     normal = jnp.stack(numerics.rotate_columns(rotation, surfels.normal), axis=-1)
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
-    foot = footprints(surfels, camera)
-    narrow = jnp.concatenate([_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
+    foot = project_discs(surfels, camera)
+    narrow = jnp.concatenate([_gather_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
-    sums = [_sum_rows(share, point, wide)]
-    drawn, deep = jnp.sum(share, axis=0), jnp.sum(share * depth, axis=0)
-    mean = deep / larger(drawn, LEAST_SHARE)
-    squared = jnp.sum(share * (depth - mean[None]) ** 2, axis=0)  # about the mean: squares would lose all digits
-    sums += [x[:, None] for x in (drawn, jnp.sum(weight * left, axis=0), mean, squared)]
-    total, deep = (jnp.sum(x, axis=0) for x in (sharp, sharp * depth))
+    sums = [_sum_rows(blend_weight, point, wide)]
+    drawn, deep = jnp.sum(blend_weight, axis=0), jnp.sum(blend_weight * depth, axis=0)
+    mean = deep / larger(drawn, LEAST_OPACITY)
+    squared = jnp.sum(blend_weight * (depth - mean[None]) ** 2, axis=0)  # about the mean: squares would lose all digits
+    sums += [x[:, None] for x in (drawn, jnp.sum(weight * transmittance, axis=0), mean, squared)]
+    total, deep = (jnp.sum(x, axis=0) for x in (sharp_weight, sharp_weight * depth))
     ahead = deep / jnp.where(total > LEAST_WEIGHT, total, 1)
-    sums += [_sum_colors(sharp, point, narrow, pixel_of, ahead, camera), total[:, None]]
+    sums += [_sum_colors(sharp_weight, point, narrow, pixel_of, ahead, camera), total[:, None]]
     slot = jnp.arange(slots, dtype=jnp.int32)
     slot_of = jnp.full(height * width, slots, jnp.int32).at[pixel_of].set(slot, mode="drop")
     of_slot = jax.lax.optimization_barrier(jnp.pad(jnp.concatenate(sums, axis=1), ((0, 1), (0, 0))))
     of_pixel = of_slot[slot_of].reshape(height, width, -1)
-    return _gather(columns(of_pixel), attributes.shape[1], camera)
+    return _normalise_sums(split_columns(of_pixel), attributes.shape[1], camera)
 
 
-def count_covered_pixels(found: Entries) -> Int[Array, ""]:
+def count_covered_pixels(entries: Entries) -> Int[Array, ""]:
     """Number of pixels that hold an entry."""
-    return found.slot[-1] + 1
+    return entries.slot[-1] + 1
 
 
 def _sum_rows(
@@ -286,24 +287,24 @@ def _sum_rows(
     return jax.lax.scan(lambda sums, at: (sums + at[0][:, None] * rows[at[1]], None), empty, places, unroll=8)[0]
 
 
-def _colors(surfels: Surfels) -> Float[Array, "points 10"]:
-    """For each disc: its colour, the line of its border, and the jump of colour across it."""
-    border = surfels.border[:, 3] + jnp.sum(surfels.border[:, :3] * surfels.position, axis=-1)
-    parts = surfels.base_color, surfels.border[:, :3], border[:, None], surfels.jump
+def _gather_colors(surfels: Surfels) -> Float[Array, "points 10"]:
+    """For each disc: its colour, the line of its color edge, and the change of colour across it."""
+    border = surfels.color_edge[:, 3] + jnp.sum(surfels.color_edge[:, :3] * surfels.position, axis=-1)
+    parts = surfels.base_color, surfels.color_edge[:, :3], border[:, None], surfels.color_jump
     return jnp.concatenate(parts, axis=1)
 
 
 def _sum_colors(
-    sharp: Float[Array, "list slots"],
+    sharp_weight: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
     rows: Float[Array, "points 12"],
     pixel_of: Int[Array, " slots"],
     ahead: Float[Array, " slots"],
     camera: Camera,
 ) -> Float[Array, "slots 5"]:
-    """Weighted sums of the discs' colours (`_colors`) where the ray meets the surface, and of the discs' centres.
+    """Weighted sums of the discs' colours where the ray meets the surface, and of the discs' centres.
 
-    A border is antialiased over one pixel.
+    Rows are those of `_gather_colors`.  A color edge is antialiased over one pixel.
     """
     right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
     up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
@@ -316,97 +317,100 @@ def _sum_colors(
         color += clamp(0.5 + beyond / pixel, 0, 1)[:, None] * jump
         return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
 
-    return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp, point), unroll=8)[0]
+    return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp_weight, point), unroll=8)[0]
 
 
-def _lists(found: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
+def _build_lists(entries: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
     """Indices of the entries of each slot, -1 where there are fewer, and the pixel of each slot."""
-    live = (found.pixel < pixels) & (found.rank < LIST) & (found.slot < slots)
-    place = jnp.where(live, found.rank * slots + found.slot, LIST * slots)
-    table = jnp.full(LIST * slots, -1, jnp.int32).at[place].set(found.order, mode="drop", unique_indices=True)
-    place = jnp.where(live & (found.rank == 0), found.slot, slots)
-    pixel_of = jnp.full(slots, pixels, jnp.int32).at[place].set(found.pixel, mode="drop", unique_indices=True)
-    return table.reshape(LIST, slots), pixel_of
+    live = (entries.pixel < pixels) & (entries.rank < LIST_LENGTH) & (entries.slot < slots)
+    cell = jnp.where(live, entries.rank * slots + entries.slot, LIST_LENGTH * slots)
+    table = jnp.full(LIST_LENGTH * slots, -1, jnp.int32).at[cell].set(entries.order, mode="drop", unique_indices=True)
+    cell = jnp.where(live & (entries.rank == 0), entries.slot, slots)
+    pixel_of = jnp.full(slots, pixels, jnp.int32).at[cell].set(entries.pixel, mode="drop", unique_indices=True)
+    return table.reshape(LIST_LENGTH, slots), pixel_of
 
 
 @jax.checkpoint
-def shares(
+def compute_blend_weights(
     tau: Float[Array, "list slots"], depth: Float[Array, "list slots"], spacing: Float[Array, "list slots"]
 ) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"]]:
-    """Share of each entry in its pixel, and the transmittance in front of it, for lists sorted by depth.
+    """Blend weight of each entry, and the transmittance in front of it, for lists sorted by depth.
 
     A layer of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
     """
-    return _shares(tau, depth, spacing)
+    return _blend_weights(tau, depth, spacing)
 
 
-def _plain_shares(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
-    hidden, band = _optical_depths(tau, depth, spacing)
-    left = jnp.exp(-hidden)
-    return tau * left * _mean_transmittance(band)[0], left
+def _plain_blend_weights(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
+    tau_before, tau_layer = _optical_depths(tau, depth, spacing)
+    transmittance = jnp.exp(-tau_before)
+    return tau * transmittance * _mean_transmittance(tau_layer)[0], transmittance
 
 
-def _pull_back_shares(
+def _pull_back_blend_weights(
     primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
 ) -> tuple[Array, Array, Array]:
-    """Gradients by tau, depth and spacing from those by share and transmittance; each pair contributes to both entries.
+    """Gradients by tau, depth and spacing; each pair of entries contributes to both.
 
-    The gradient that JAX derives takes twenty times as long as the shares themselves.
+    The gradient that JAX derives takes twenty times as long as the weights themselves.
     """
     tau, depth, spacing = primals
-    by_share, by_left = cotangents
-    hidden, band = _optical_depths(*primals)
-    left, (mean, slope) = jnp.exp(-hidden), _mean_transmittance(band)
-    by_band = by_share * (tau * left * slope)
-    by_hidden = -left * (by_left + by_share * (tau * mean))
-    by_tau = by_share * (left * mean) + by_band + jnp.matmul(_far(len(tau)).T, by_hidden, precision="highest")
+    by_weight, by_transmittance = cotangents
+    tau_before, tau_layer = _optical_depths(*primals)
+    transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_layer)
+    by_layer = by_weight * (tau * transmittance * slope)
+    by_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
+    by_tau = by_weight * (transmittance * mean) + by_layer
+    by_tau += jnp.matmul(_far_in_front(len(tau)).T, by_before, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
-    by_band, by_hidden = map(jax.lax.optimization_barrier, (by_band, by_hidden))  # one would be linear in all
-    known = tau, depth, spacing, by_band, by_hidden
-    for step, (other_tau, *places, other_band, other_hidden) in _neighbours(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
-        gap, middle = _gap(step, depth, spacing, *places)
+    by_layer, by_before = map(jax.lax.optimization_barrier, (by_layer, by_before))  # one would be linear in all
+    known = tau, depth, spacing, by_layer, by_before
+    for step, (other_tau, *places, other_by_layer, other_by_before) in _shift_lists(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
+        gap, middle = _measure_gap(step, depth, spacing, *places)
         x = clamp(gap - 1, 0, 1)
         apart, slope = x * x * (3 - 2 * x), 6 * x * (1 - x)
-        by_tau += other_band * (1 - apart) + (other_hidden * apart if step > 0 else 0)
-        through = tau * other_hidden if step > 0 else other_tau * by_hidden  # the front entry occludes the one behind
-        by_gap = slope * (through - other_tau * by_band - tau * other_band)
+        by_tau += other_by_layer * (1 - apart) + (other_by_before * apart if step > 0 else 0)
+        through = tau * other_by_before if step > 0 else other_tau * by_before  # the front entry occludes the other
+        by_gap = slope * (through - other_tau * by_layer - tau * other_by_layer)
         by_depth += np.sign(-step) * by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
     return by_tau, by_depth, by_spacing
 
 
-_shares = numerics.with_gradient(_plain_shares, _pull_back_shares)
+_blend_weights = numerics.with_gradient(_plain_blend_weights, _pull_back_blend_weights)
 
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
     """Optical depth in front of each entry's layer, and that of the layer."""
-    hidden, band = jnp.matmul(_far(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
-    for step, (other_tau, *places) in _neighbours((tau, depth, spacing), (0.0, 0.0, 1.0)):
-        apart = smoothstep(_gap(step, depth, spacing, *places)[0] - 1)
-        band += other_tau * (1 - apart)
+    tau_before, tau_layer = jnp.matmul(_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
+    for step, (other_tau, *places) in _shift_lists((tau, depth, spacing), (0.0, 0.0, 1.0)):
+        apart = smoothstep(_measure_gap(step, depth, spacing, *places)[0] - 1)
+        tau_layer += other_tau * (1 - apart)
         if step < 0:
-            hidden += other_tau * apart
-    return hidden, band
+            tau_before += other_tau * apart
+    return tau_before, tau_layer
 
 
-def _far(length: int) -> Array:
+def _far_in_front(length: int) -> Array:
     """1 where the column's entry is so far in front of the row's entry in the list that it occludes it untested."""
-    return jnp.tril(jnp.ones((length, length)), -NEAR - 1)
+    return jnp.tril(jnp.ones((length, length)), -COMPARED - 1)
 
 
-def _neighbours(
+def _shift_lists(
     lists: tuple[Array, ...], beyond: tuple[float, ...]
 ) -> Iterator[tuple[int, list[Float[Array, "list slots"]]]]:
     """The lists shifted by each of the compared distances, forwards and backwards."""
     padded = [
-        jax.lax.optimization_barrier(jnp.pad(x, ((NEAR, NEAR), (0, 0)), constant_values=c))
+        jax.lax.optimization_barrier(jnp.pad(x, ((COMPARED, COMPARED), (0, 0)), constant_values=c))
         for x, c in zip(lists, beyond, strict=True)
     ]
-    for step in [*range(-NEAR, 0), *range(1, NEAR + 1)]:
-        yield step, [x[NEAR + step : NEAR + step + len(lists[0])] for x in padded]
+    for step in [*range(-COMPARED, 0), *range(1, COMPARED + 1)]:
+        yield step, [x[COMPARED + step : COMPARED + step + len(lists[0])] for x in padded]
 
 
-def _gap(step: int, depth: Array, spacing: Array, other_depth: Array, other_spacing: Array) -> tuple[Array, Array]:
+def _measure_gap(
+    step: int, depth: Array, spacing: Array, other_depth: Array, other_spacing: Array
+) -> tuple[Array, Array]:
     """Distance in depth between two entries in spacings, and the mean of their spacings."""
     middle = 0.5 * (spacing + other_spacing)
     return np.sign(-step) * (depth - other_depth) / middle, middle
@@ -414,33 +418,33 @@ def _gap(step: int, depth: Array, spacing: Array, other_depth: Array, other_spac
 
 def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
     """(1 - exp(-tau)) / tau of a layer, and its derivative; a series for small tau, where all digits would cancel."""
-    thin = tau < THIN
+    thin = tau < THIN_TAU
     thick = jnp.where(thin, 1, tau)
     mean = jnp.where(thin, 1 - tau * (1 / 2 - tau * (1 / 6 - tau / 24)), one_minus_exp(thick) / thick)
     slope = jnp.where(thin, -1 / 2 + tau * (1 / 3 - tau * (1 / 8 - tau / 30)), (jnp.exp(-thick) - mean) / thick)
     return mean, slope
 
 
-def _gather(sums: list[Array], features: int, camera: Camera) -> GBuffer:
+def _normalise_sums(sums: list[Array], features: int, camera: Camera) -> GBuffer:
     """Normalises the sums of `blend` to means."""
     wide, rest, narrow = sums[: features + 4], sums[features + 4 : features + 8], sums[features + 8 :]
-    share, coverage, depth, squared = rest
-    inverse = 1 / larger(share, LEAST_SHARE)
+    blend_weight, coverage, depth, squared = rest
+    inverse = 1 / larger(blend_weight, LEAST_OPACITY)
     *wide, log_spacing = (x * inverse for x in wide)
     *color, column, row, sharp = narrow
     has_color = sharp > LEAST_WEIGHT
     inverse_sharp = jnp.where(has_color, 1 / jnp.where(has_color, sharp, 1), 0)
     middles = (jnp.arange(camera.width) + 0.5)[None], (jnp.arange(camera.height) + 0.5)[:, None]
-    beside = (column, middles[0]), (row, middles[1])
+    offsets = (column, middles[0]), (row, middles[1])
     return GBuffer(
-        opacity=smaller(share, 1),
+        opacity=smaller(blend_weight, 1),
         coverage=coverage,
         depth=depth,
-        spread=root(squared * inverse),
+        depth_deviation=safe_sqrt(squared * inverse),
         log_spacing=log_spacing,
         normal=jnp.stack(wide[features:], axis=-1),
         color=jnp.stack([c * inverse_sharp for c in color], axis=-1),
         attributes=jnp.stack(wide[:features], axis=-1),
-        centres=sharp,
-        beside=jnp.stack([(total - sharp * pixels) / (sharp + FAR) for total, pixels in beside], axis=-1),
+        sharp_weight=sharp,
+        centre_offset=jnp.stack([(total - sharp * pixels) / (sharp + FADE) for total, pixels in offsets], axis=-1),
     )

@@ -11,7 +11,7 @@ import tyro
 
 from spnr_jax import presets
 from spnr_jax.config import Cut, Schedule, TrainConfig
-from spnr_jax.errors import UserError, at_least, require, within
+from spnr_jax.errors import UserError, require, require_at_least, require_within
 
 MOST_STOPS = 20
 
@@ -43,14 +43,14 @@ class Lighting:
         require(math.isfinite(self.light_yaw), f"--light-yaw must be a number of degrees, got {self.light_yaw}")
         if self.sun and not (math.isfinite(self.sun[0]) and -90 <= self.sun[1] <= 90):
             raise UserError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
-        within(self, -MOST_STOPS, MOST_STOPS, "exposure")
+        require_within(self, -MOST_STOPS, MOST_STOPS, "exposure")
 
 
 MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on telephones draw
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatMaking:
+class SplatOptions:
     """How Gaussian splats are made from a cloud."""
 
     most_splats: int = 150_000
@@ -62,12 +62,12 @@ class SplatMaking:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        within(self, 1, MOST_SPLATS, "most_splats")
-        at_least(self, 4, "fitting_views")
+        require_within(self, 1, MOST_SPLATS, "most_splats")
+        require_at_least(self, 4, "fitting_views")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class ReadOptions:
     """How a file of points or a mesh is read."""
 
     num_points: int = 16384
@@ -80,11 +80,11 @@ class Reading:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        at_least(self, 1, "num_points")
+        require_at_least(self, 1, "num_points")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share(Reading):
+class Share(ReadOptions):
     """Write one .html file that shows a cloud's object in any browser: Gaussian splats to turn, a poster, a title."""
 
     cloud: tyro.conf.Positional[Path]
@@ -99,7 +99,7 @@ class Share(Reading):
     """Network that renders it, as for `spnr render` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into the splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
     """How the splats are made."""
     azimuth: float = 30.0
     """Azimuth, in degrees, of the page's first view."""
@@ -111,7 +111,7 @@ class Share(Reading):
         super().__post_init__()
         if self.out.suffix.lower() not in (".html", ".htm") or self.out.is_dir():
             raise UserError(f"--out {self.out}: expected the name of an .html file")
-        within(self, -89, 89, "elevation")
+        require_within(self, -89, 89, "elevation")
         at_white = self.lighting.background == "white"
         require(at_white, "--background light: a page shows its object on white; leave it out")
 
@@ -120,7 +120,7 @@ Output = Literal["image", "depth", "opacity"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Reading):
+class Render(ReadOptions):
     """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity."""
 
     cloud: tyro.conf.Positional[Path]
@@ -175,9 +175,9 @@ class Render(Reading):
         super().__post_init__()
         names = [cloud.stem for cloud in (self.cloud, *self.others)]
         require(len(set(names)) == len(names), "two clouds have one name; give them an --out each")
-        at_least(self, 0, "views")
-        at_least(self, 1, "frames", "fps")
-        within(self, -90, 90, "elevation")
+        require_at_least(self, 0, "views")
+        require_at_least(self, 1, "frames", "fps")
+        require_within(self, -90, 90, "elevation")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
             raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
         if self.transparent and self.lighting.background != "white":
@@ -230,7 +230,7 @@ class Export:
     """Network that renders the cloud for --splats, as `spnr render --run` (default: surfels)."""
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
     """Light baked into --splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatMaking] = field(default_factory=SplatMaking)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
     """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The upward axis of the file for --splats, which are written with y up."""
@@ -251,10 +251,10 @@ class Export:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        at_least(self, 1, "num_points")
+        require_at_least(self, 1, "num_points")
         given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
         given += ["light"] if self.lighting.is_given else []
-        given += ["most-splats"] if self.making != SplatMaking() else []
+        given += ["most-splats"] if self.making != SplatOptions() else []
         require(
             self.splats is not None or not given, f"--{''.join(given[:1])} is for --splats FILE, which is not given"
         )
@@ -263,7 +263,7 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Reading):
+class View(ReadOptions):
     """View the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
     cloud: tyro.conf.Positional[Path]

@@ -1,4 +1,4 @@
-"""What leaves the package: a cloud's object as splats or as a page for any browser, and the network itself.
+"""Exports: a cloud's object as splats or as a page for any browser, and the network itself.
 
 Splats have y up, the units of the cloud's file and, unless float32 is too coarse there, its origin.
 
@@ -54,7 +54,7 @@ from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Export, Render, Share
-from spnr_jax.tools.pictures import Ready, prepare_cloud
+from spnr_jax.tools.pictures import PreparedObject, prepare_cloud
 from spnr_jax.training import weights
 
 # --- objects ----------------------------------------------------------------------------------------------------------
@@ -68,16 +68,16 @@ Say = Callable[[str], None]
 
 def export_object(options: Export, note: Say) -> str:
     """Writes a cloud's splats; a line about it.  `note` gets the assumptions about the cloud."""
-    asked = as_rendered(options, options.run, options.network)
+    render_options = make_render_options(options, options.run, options.network)
     assert options.splats is not None
     check_suffix(options.splats)
-    made = _splats(prepare_cloud(asked, note), options, note)
-    size = write_splats(options.splats, made, make_note(asked))
-    return f"wrote {options.splats} ({len(made.opacity):,} splats, {size / 1e6:.1f} MB)"
+    gaussians = _splats(prepare_cloud(render_options, note), options, note)
+    size = write_splats(options.splats, gaussians, describe_source(render_options))
+    return f"wrote {options.splats} ({len(gaussians.opacity):,} splats, {size / 1e6:.1f} MB)"
 
 
-def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Render:
-    """What the options ask of a cloud, as those of `spnr render`."""
+def make_render_options(options: Export | Share, cloud: Path, run: Path | None) -> Render:
+    """The same options for a cloud in the form of `spnr render`."""
     return Render(
         cloud=cloud,
         run=run,
@@ -88,28 +88,28 @@ def as_rendered(options: Export | Share, cloud: Path, run: Path | None) -> Rende
     )
 
 
-def make_note(asked: Render) -> str:
+def describe_source(options: Render) -> str:
     """The line that names cloud, network and light, without folders."""
-    light = Path(asked.lighting.light or ("sun" if asked.lighting.sun else "room")).name
-    return f"{asked.cloud.name}, drawn by spnr_jax ({Path(asked.run or weights.SHIPPED).name}), light: {light}"
+    light = Path(options.lighting.light or ("sun" if options.lighting.sun else "room")).name
+    return f"{options.cloud.name}, drawn by spnr_jax ({Path(options.run or weights.PACKAGED).name}), light: {light}"
 
 
 def share(options: Share, note: Say) -> str:
     """Writes the page of a cloud; a line about it.  `note` gets the assumptions about the cloud."""
     images.check_place(options.out)
-    asked = as_rendered(options, options.cloud, options.run)
-    ready = prepare_cloud(asked, note)
+    render_options = make_render_options(options, options.cloud, options.run)
+    ready = prepare_cloud(render_options, note)
     gaussians = _splats(ready, options, note)
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
-    said = " · ".join(filter(None, [make_note(asked), options.credit]))
+    caption = " · ".join(filter(None, [describe_source(render_options), options.credit]))
     view = (options.azimuth, options.elevation)
-    content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, said)
+    content = page(gaussians, poster, camera, view, options.title or options.cloud.stem, caption)
     images.write_whole(options.out, content)
     return f"wrote {options.out} ({len(gaussians.opacity):,} splats, {len(content) / 1e6:.1f} MB)"
 
 
-def _splats(ready: Ready, options: Export | Share, note: Say) -> Gaussians:
+def _splats(ready: PreparedObject, options: Export | Share, note: Say) -> Gaussians:
     how = options.making
     gaussians = surfaces.splats(
         ready.model,
@@ -146,7 +146,7 @@ def page(
         "DATA": base64.b64encode(spz_of(gaussians)).decode(),
     }
     text = resources.files("spnr_jax.tools").joinpath("share_page.html").read_text("utf-8")
-    first, *others = text.split("@")  # what stands between two is a name: the parts hold any characters
+    first, *others = text.split("@")  # text between two @ is a name: the parts may hold any characters
     content = (first + "".join(parts.get(piece, piece) for piece in others)).encode(errors="replace")
     if len(content) > MOST_BYTES:
         raise UserError(
@@ -159,14 +159,14 @@ def page(
 # --- the network ------------------------------------------------------------------------------------------------------
 
 
-RADIUS = 0.8  # of the ball in the box whose pictures the sizes are those of: as much surface as a cube has
+RADIUS = 0.8  # of the ball in the box for whose pictures the sizes are planned: it has as much surface as a cube
 BLOCK = 256  # points whose distances to all are in memory at once
 
 Arrays = dict[str, Any]
 
 
 def export_network(options: Export) -> str:
-    """Writes what `spnr export RUN` does; a line about it."""
+    """Writes the files of `spnr export RUN`; returns a line about them."""
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
     model = Model(config=trained.config.model, variables=trained.variables)
     _check_exportable(model)
@@ -208,7 +208,7 @@ def export_render(
     """The serialised function `(volume, camera, light) -> picture` for square pictures, by default of the network's
     size, for scenes of `num_points` points.
 
-    The sizes are those of a plan: by default of a ball of so many points, with room to spare.  `platforms` as for
+    Sizes come from a plan, by default that of a ball with `num_points` points, with a margin.  `platforms` as for
     `export_encode`.
     """
     _check_exportable(model)
@@ -230,7 +230,7 @@ def load_exported(content: bytes) -> Callable[..., Arrays]:
 
 
 def signature(content: bytes) -> dict[str, Any]:
-    """Shapes and types of what an exported function takes (a list, for its arguments) and gives, and its platforms."""
+    """Shapes and types of the arguments (a list) and outputs of an exported function, and its platforms."""
     exported = _deserialise(content)
     (arguments, _), outputs = (
         jax.tree.map(lambda x: {"shape": list(x.shape), "dtype": str(x.dtype)}, jax.tree.unflatten(tree, shapes))
@@ -265,8 +265,8 @@ def encode(params: dict, cloud: Arrays) -> Arrays:
 def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
     """The picture of a scene as a dict of arrays; pure."""
     scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
-    seen = Camera(**camera, height=size, width=size)
-    drawn = surfel_renderer.render(params, scene, seen, Light(**light), plan=plan)
+    view = Camera(**camera, height=size, width=size)
+    drawn = surfel_renderer.render(params, scene, view, Light(**light), plan=plan)
     return {name: getattr(drawn, name) for name in ("image", "depth", "acc", "overflow")}
 
 
@@ -286,16 +286,16 @@ def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " point
 
 
 def make_plan(model: Model, num_points: int, size: int) -> Plan:
-    """Sizes for pictures of any object of so many points from where `Model.camera` stands: with room to spare."""
+    """Sizes, with a margin, for pictures of any object of `num_points` points by `Model.camera`."""
     ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
     scene = surfel_method.encode_in_box(ball)
-    made = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
-    side = surfel_renderer.round_up(-(-size * made.side // 2**made.doublings) + surfel_renderer.MARGIN)
-    return made._replace(width=side, height=side, entries=2 * made.entries, slots=side * side)
+    plan = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
+    side = surfel_renderer.round_up(-(-size * plan.side // 2**plan.doublings) + surfel_renderer.MARGIN)
+    return plan._replace(width=side, height=side, entries=2 * plan.entries, slots=side * side)
 
 
 def cloud_shapes(num_points: int) -> Arrays:
-    """What `encode` takes."""
+    """Shapes of the arguments of `encode`."""
     vectors, scalars, mask = _floats(num_points, 3), _floats(num_points), jax.ShapeDtypeStruct((num_points,), np.bool_)
     return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
 

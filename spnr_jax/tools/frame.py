@@ -1,8 +1,8 @@
-"""What one browser sees: its object and light, where it looks from, and the frame that the network draws of that.
+"""The state of one browser (object, light, camera), and the frame that the network renders for it.
 
-The browser lives in the network's box.  `field_of_view` is vertical, in radians; `reach` is the tangent of half of what
-a square sees.  The network draws squares, one program for each size: in the middle of the canvas, around the whole
-object or, where that is less or something stands behind it, the canvas.  `read_*` make safe what a browser sends.
+The browser lives in the network's box.  `field_of_view` is vertical, in radians; `reach` is the tangent of half the
+field of view of a square.  The network renders squares, one program per size: in the middle of the canvas, around the
+whole object or, if smaller or if there is a background, around the canvas.  `read_*` validate messages of a browser.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Lighting
-from spnr_jax.tools.pictures import before, light_of_options
+from spnr_jax.tools.pictures import light_of_options, put_background
 
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
-OBJECT = 1.2  # radius of a ball in the box that holds all that is drawn of the object; its points lie within 1
+OBJECT_RADIUS = 1.2  # of a ball in the box that contains the drawn object; its points lie within 1
 FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
 MOST_PIXELS = 2**16  # along a side of a browser's canvas
 NARROWEST, WIDEST = 1e-3, np.deg2rad(150)
@@ -52,7 +52,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """All that decides a frame; `light()` is that of `lighting` and `maps`, made when it is first drawn in."""
+    """Everything that determines a frame; `light()` follows from `lighting` and `maps` and is made at first use."""
 
     name: str
     cloud: PointCloud
@@ -75,7 +75,7 @@ class State:
 
 
 def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -> State:
-    """What a browser sees first of a cloud that was just read; ValueError for what cannot be encoded or is no map."""
+    """The initial state for a cloud; ValueError if it cannot be encoded, or if the light is no map."""
     state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting)
     if lighting.light is None or lighting.light in NAMES:
         return relight(state, lighting) if lighting.is_given else state
@@ -83,20 +83,20 @@ def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -
 
 
 def qualities(model: Model) -> dict[str, tuple[Quality, int]]:
-    """What a picture at rest can be, by name: how it is drawn, and pixels along a side of the network's square."""
+    """Choices for a picture at rest, by name: quality, and pixels along a side of the network's square."""
     size = 2 * min(model.config.image_resolution, SMALLEST)
     named: dict[str, tuple[Quality, int]] = {name: (name, size) for name in ("draft", "balanced", "best")}
     return named | {"best, twice the pixels": ("best", 2 * size)}
 
 
 def add_map(state: State, name: str, light: Light) -> State:
-    """The state with one more map, which is chosen; one of the same name is replaced."""
+    """The state with one more map, which becomes the light; a map of the same name is replaced."""
     with_map = dataclasses.replace(state, maps={**state.maps, name: light})
     return relight(with_map, dataclasses.replace(state.lighting, light=name))
 
 
 def read_lighting(state: State, choice: Any, yaw: Any, exposure: Any) -> Lighting:
-    """The light that the controls say, with the state's sun; ValueError for what they cannot say."""
+    """The lighting of the controls, with the state's sun; ValueError for invalid values."""
     values = read_numbers([yaw, exposure], 2)
     if values is None or choice not in state.lights:
         raise UserError("a light has a name of the list, and a turn and an exposure that are numbers")
@@ -128,12 +128,12 @@ def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
     reach = square_reach(view, whole=behind != "white")
     camera, light = square_camera(view, state.volume, reach, size), state.light()
     rendering = model.render(state.volume, camera, quality, light)
-    square = images.to_uint8(before(behind, rendering, camera, light).image)
-    return fill(square, view, reach, MOVING_LONGEST if moving else LONGEST)
+    square = images.to_uint8(put_background(behind, rendering, camera, light).image)
+    return place_square(square, view, reach, MOVING_LONGEST if moving else LONGEST)
 
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
-    """The view of a browser's message of any values; None if nothing can be drawn from it (NaN, no pixels, far)."""
+    """The view of a browser's message; None if it is invalid (NaN, no pixels, too far)."""
     turn, place, canvas = (
         read_numbers(wxyz, 4),
         read_numbers(position, 3),
@@ -151,12 +151,12 @@ def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: 
 
 
 def square_reach(view: View, whole: bool) -> float:
-    """The reach of the square that holds the object or, if that is less or `whole` is wanted, covers the canvas."""
+    """The reach of the square that contains the object or, if smaller or if `whole`, covers the canvas."""
     covering, distance = _covering(view), np.linalg.norm(view.position)
-    if whole or distance <= OBJECT:
+    if whole or distance <= OBJECT_RADIUS:
         return covering
     aside = np.arccos(np.clip(view.position @ view.rotation[:, 2] / distance, -1, 1))  # of the object's middle
-    furthest = aside + np.arcsin(OBJECT / distance)
+    furthest = aside + np.arcsin(OBJECT_RADIUS / distance)
     return covering if furthest >= np.pi / 2 else min(covering, float(np.tan(furthest)))
 
 
@@ -169,7 +169,7 @@ def square_camera(view: View, volume: Volume, reach: float, size: int) -> Camera
     return Camera(cam_to_world=pose, intrinsics=intrinsics, height=size, width=size)
 
 
-def fill(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
+def place_square(square: np.ndarray, view: View, reach: float, longest: int) -> np.ndarray:
     """The canvas, at most `longest` pixels along its longer side, with a square picture in its middle, on white."""
     shrink = min(1.0, longest / max(view.width, view.height))
     width, height = (max(round(side * shrink), 1) for side in (view.width, view.height))
@@ -186,7 +186,7 @@ def _covering(view: View) -> float:
 
 
 def read_numbers(values: Any, *shape: int) -> np.ndarray | None:
-    """What a browser sent as finite numbers of a shape, None if it is something else."""
+    """Values of a browser as finite numbers of a shape; None if they are anything else."""
     try:
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -195,13 +195,13 @@ def read_numbers(values: Any, *shape: int) -> np.ndarray | None:
 
 
 def display_name(name: str) -> str:
-    """The last part of a browser's file name, without what Markdown or a path could make of it."""
+    """The last part of a browser's file name, without characters that matter to Markdown or paths."""
     last = PurePath(name.replace("\\", "/")).name
     return "".join(c if c.isalnum() or c in "._- " else "_" for c in last)[-LONGEST_NAME:].strip() or "file"
 
 
 def read_upload(name: str, content: bytes, read: Callable[[Path], Read]) -> Read:
-    """What `read` makes of a file's bytes; ValueError, with the name as shown, for what cannot be read."""
+    """The result of `read` for a file's bytes; ValueError, with the displayed name, if it cannot be read."""
     shown = display_name(name)
     with tempfile.TemporaryDirectory(prefix="spnr-view-") as folder:
         path = Path(folder) / f"upload{PurePath(shown).suffix.lower()}"

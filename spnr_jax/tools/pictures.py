@@ -35,7 +35,7 @@ from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
-from spnr_jax.surfels.lighting import background
+from spnr_jax.surfels.lighting import look_up_background
 from spnr_jax.surfels.skies import sun
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.surfaces import surface_depth
@@ -45,35 +45,35 @@ SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, sli
 
 
 def light_of_options(options: Lighting, read: Callable[[str], Light] = read_light) -> Light:
-    """The light that the options ask for; `read` gives that of a map by its name."""
+    """The light of the options; `read` returns the light of a map by name."""
     parts = [read(options.light or "room").turned(options.light_yaw)] if options.light or not options.sun else []
     parts += [sun(*options.sun, color=SUN)] if options.sun else []
     return 2.0**options.exposure * reduce(add, parts)
 
 
-def check_takes_light(model: Model, asked: Sequence[str], run: Path | None) -> None:
-    """ValueError, naming the options, where something is asked of the light and the network takes none."""
-    if asked and not method_of(model.config).takes_light:
+def check_takes_light(model: Model, names: Sequence[str], run: Path | None) -> None:
+    """ValueError, naming the options, if light options are given and the network takes no light."""
+    if names and not method_of(model.config).takes_light:
         raise UserError(
-            f"{', '.join(asked)}: the network of --run {run} knows the light of its training alone; "
-            f"leave {'it' if len(asked) == 1 else 'them'} out, or --run"
+            f"{', '.join(names)}: the network of --run {run} knows the light of its training alone; "
+            f"leave {'it' if len(names) == 1 else 'them'} out, or --run"
         )
 
 
-def before(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
-    """The picture before what is wanted behind it: white, as it is, or the map of the light."""
+def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
+    """The picture in front of its background: white, or the map of the light."""
     if wanted == "white" or light is None:
         return rendering
-    behind = np.asarray(_behind(light, camera))
+    behind = np.asarray(_draw_background(light, camera))
     image = np.asarray(rendering.image) + (1 - np.asarray(rendering.acc))[..., None] * (behind - 1)
     return dataclasses.replace(rendering, image=image)
 
 
 @jax.jit
-def _behind(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
-    """The light's map as a camera sees it, sRGB."""
+def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
+    """The environment map as seen by a camera, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
-    return linear_to_srgb(jnp.minimum(jnp.stack(background(light, towards), axis=-1), 1))
+    return linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1))
 
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
@@ -81,8 +81,8 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ready:
-    """A cloud that is read and encoded, and what draws it."""
+class PreparedObject:
+    """An encoded cloud, and the model and light that render it."""
 
     placed: PlacedCloud
     model: Model
@@ -91,14 +91,14 @@ class Ready:
 
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
-    """Writes what the options ask for; yields a line about each file, `note` gets the assumptions about the cloud."""
+    """Writes the files of the options; yields a line about each; `note` gets the assumptions about the cloud."""
     images.check_place(options.out / options.cloud.stem)
     ready = prepare_cloud(options, note)
     yield f"encoded {len(ready.placed.cloud.positions)} points of {options.cloud}"
     yield from run_ahead(draw_all(ready, options, options.out / options.cloud.stem))
 
 
-def prepare_cloud(options: Render, note: Callable[[str], None]) -> Ready:
+def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObject:
     """The cloud of the options read and encoded; `note` gets the assumptions about it.
 
     ValueError, before the cloud is read, for a run that is none or a network that cannot draw what is asked for.
@@ -116,18 +116,18 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> Ready:
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    return Ready(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
+    return PreparedObject(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
 
 
-def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[], str]]:
-    """Draws what the options ask for; yields what writes it, in any thread, and gives a line about it.
+def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Callable[[], str]]:
+    """Renders the views of the options; yields functions that write a file, in any thread, and return a line about it.
 
-    Stills and film are drawn in one go: views that share their sizes share their programs.
+    Stills and film are rendered together: views with the same sizes share programs.
     """
     stills = still_views(ready, options)
     film = turntable_views(ready, options) if options.turntable != "none" else []
     views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
-    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the film's are left for below
+    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", still_files(rendering, camera, ready.volume, options))
     if cameras:
         document = cameras_document(cameras, name.name, ready.placed, ready.volume)
@@ -140,13 +140,13 @@ def draw_all(ready: Ready, options: Render, name: Path) -> Iterator[Callable[[],
 View = tuple[Camera, Light | None]
 
 
-def still_views(ready: Ready, options: Render) -> list[View]:
+def still_views(ready: PreparedObject, options: Render) -> list[View]:
     """Cameras evenly around the object, and its light."""
     turns = np.arange(options.views) * 360 / max(options.views, 1)
     return [(_camera(ready, FIRST_AZIMUTH + turn, options), ready.light) for turn in turns]
 
 
-def turntable_views(ready: Ready, options: Render) -> list[View]:
+def turntable_views(ready: PreparedObject, options: Render) -> list[View]:
     """Camera and light of each image of one turn around the object, or of its light."""
     turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
     if options.turn == "object" or light is None:
@@ -154,16 +154,16 @@ def turntable_views(ready: Ready, options: Render) -> list[View]:
     return [(_camera(ready, FIRST_AZIMUTH, options), light.turned(turn)) for turn in turns]
 
 
-def _camera(ready: Ready, azimuth: float, options: Render) -> Camera:
+def _camera(ready: PreparedObject, azimuth: float, options: Render) -> Camera:
     return ready.model.camera(ready.volume, float(azimuth), options.elevation, options.resolution)
 
 
-def _draw(ready: Ready, views: list[View], options: Render) -> Iterator[Rendering]:
-    """The pictures of cameras in lights, one after the other, before what is wanted behind them."""
+def _draw(ready: PreparedObject, views: list[View], options: Render) -> Iterator[Rendering]:
+    """Renderings of the views, one after the other, in front of their background."""
     cameras, lights = [camera for camera, _ in views], [light for _, light in views]
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
     for (camera, light), rendering in zip(views, renderings, strict=True):
-        yield before(options.lighting.background, rendering, camera, light)
+        yield put_background(options.lighting.background, rendering, camera, light)
 
 
 def _write_still(stem: str, files: Iterator[tuple[str, bytes]]) -> str:
@@ -178,7 +178,7 @@ def _write_film(path: Path, film: list[np.ndarray], options: Render) -> str:
 
 
 def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> Iterator[tuple[str, bytes]]:
-    """(what follows the view's name, content) of the files of one view."""
+    """(suffix of the name, content) of the files of one view."""
     acc = np.asarray(rendering.acc)
     if "image" in options.outputs:
         image = np.asarray(rendering.image)
@@ -193,7 +193,7 @@ def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: R
 
 
 def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
-    """RGBA (h, w, 4) in [0, 1] that gives the image when it is laid on white; the opacity (h', w') is interpolated."""
+    """RGBA (h, w, 4) in [0, 1] that equals the image on white; the opacity (h', w') is interpolated."""
     alpha = np.asarray(Image.fromarray(acc.astype(np.float32)).resize(image.shape[1::-1], Image.Resampling.BILINEAR))
     alpha = np.clip(alpha, 0, 1)[..., None]
     color = (np.clip(image, 0, 1) - (1 - alpha)) / np.maximum(alpha, INVISIBLE)
@@ -201,7 +201,7 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
 
 
 def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:
-    """The views in the nerfstudio convention, and what was done to the points: box = scale * (rotation p - centre)."""
+    """The views in the nerfstudio convention, and the transform of the points: box = scale * (rotation p - centre)."""
     camera = cameras[0]
     intrinsics, scale = np.asarray(camera.intrinsics, np.float64), float(volume.scale)
     return {

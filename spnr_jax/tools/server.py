@@ -1,15 +1,14 @@
-"""The server behind `spnr view`: loads the network and a cloud, and gives every browser that comes its own controls.
+"""The server behind `spnr view`: loads the network and a cloud, and gives each browser its own controls.
 
-Every control submits a change to the loop that draws for its browser.  Quick callbacks are coroutines, which viser runs
-in the order of the browser's messages, so the last value of a slider wins; slow ones (reading a file) are plain
-functions, which it runs in threads.
+Every control submits a change to the render loop of its browser.  Quick callbacks are coroutines, which viser runs in
+the order of the browser's messages, so the last value of a slider wins; slow ones (reading a file) are plain functions,
+which run in threads.
 
-It listens on this machine alone unless `--host` says otherwise, and talks to its own page alone.  A web page of any
-address that is open in the same browser can connect to a server on this machine, and viser asks nobody who he is.  So
-the path of the viewer's address begins with a token, made anew for every viewer, without which no page is served and no
-WebSocket is opened; the page's own connection takes the token from its address.  Where a browser names the origin of
-what asks, it has to be the address that was asked or, behind a proxy, `reached_at`.  viser's tunnel to a public
-address, which any browser could ask for, is closed.
+The server listens only on this machine unless `--host` says otherwise, and serves only its own page.  Any web page that
+is open in the same browser can connect to a local server, and viser has no authentication.  So the path of the viewer's
+address begins with a random token; without it, no page is served and no WebSocket is opened.  The page's own connection
+takes the token from its address.  If a browser sends an origin, it must be the host that was requested or, behind a
+proxy, `reached_at`.  viser's tunnel to a public address, which any browser could request, is disabled.
 """
 
 import contextlib
@@ -44,36 +43,36 @@ from spnr_jax.training.weights import load
 LENGTH = 16  # bytes of a token
 CLOSED = "Open the address that `spnr view` printed, whole: it holds a token.\n"
 FOREIGN = "This page is not that of the viewer.\n"
-DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # which a browser leaves out of an origin
+DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # omitted by browsers in an origin
 _guarding = threading.Lock()
 Shown = TypeVar("Shown")
 
-Asked = Callable[[Any, Request], Any]
+RequestHook = Callable[[Any, Request], Any]
 
 
 def new_token() -> str:
-    """A token of characters that an address may hold."""
+    """A random token of URL-safe characters."""
     return secrets.token_urlsafe(LENGTH)
 
 
-def admit(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
-    """The request with the path behind the token, or why it is refused."""
+def check_request(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
+    """The request with the path after the token, or a refusal."""
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
         return _refusal(CLOSED)
-    origins, asked = request.headers.get_all("Origin"), request.headers.get_all("Host")
-    if not all(_is_own(origin, asked, reached_at) for origin in origins):
+    origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
+    if not all(_is_own(origin, hosts, reached_at) for origin in origins):
         return _refusal(FOREIGN)
     return dataclasses.replace(request, path="/" + rest)
 
 
-def _is_own(origin: str, asked: list[str], reached_at: str | None) -> bool:
-    """Whether an origin is the host that was asked, or reached_at; "null" (a file, a sandbox) is neither."""
-    scheme, _, place = origin.lower().partition("://")
+def _is_own(origin: str, hosts: list[str], reached_at: str | None) -> bool:
+    """Whether an origin is the requested host or reached_at; "null" (a file, a sandbox) is neither."""
+    scheme, _, address = origin.lower().partition("://")
     if scheme not in DEFAULT_PORTS:
         return False
     known = (reached_at or "").lower().removesuffix(DEFAULT_PORTS[scheme])
-    return [place] == [host.lower() for host in asked] or (known != "" and place == known)
+    return [address] == [host.lower() for host in hosts] or (known != "" and address == known)
 
 
 def _refusal(why: str) -> Response:
@@ -83,17 +82,17 @@ def _refusal(why: str) -> Response:
 
 
 @contextlib.contextmanager
-def guard(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
-    """Servers of websockets that are opened meanwhile, in whatever thread, admit what knows the token; their list.
+def require_token(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
+    """WebSocket servers that are opened meanwhile, in any thread, require the token; yields their list.
 
-    viser opens its server in its own thread and has no hook for who is let in, hence the replaced function.
+    viser opens its server in its own thread and has no hook for authentication, so a function is replaced.
     """
     original: Any = websockets.asyncio.server.serve
     opened: list[Any] = []
 
-    def serve(*arguments: Any, process_request: Asked | None = None, **options: Any) -> Any:
+    def serve(*arguments: Any, process_request: RequestHook | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
-            answer = admit(request, token, reached_at)
+            answer = check_request(request, token, reached_at)
             if isinstance(answer, Response) or process_request is None:
                 return answer if isinstance(answer, Response) else None
             return process_request(connection, answer)
@@ -112,11 +111,11 @@ def guard(token: str, reached_at: str | None = None) -> Iterator[list[Any]]:
 # --- one browser ------------------------------------------------------------------------------------------------------
 
 
-REST = 0.2  # seconds without a change after which the better picture is drawn
+REST = 0.2  # seconds without a change after which the picture at rest is rendered
 
 
 class Loop(Generic[Shown]):
-    """Calls `show(state, moving)` after changes (moving), and when none came for `rest` seconds (not moving)."""
+    """Calls `show(state, moving)` after changes (moving), and after `rest` seconds without one (not moving)."""
 
     def __init__(self, state: Shown, show: Callable[[Shown, bool], None], rest: float = REST) -> None:
         self.state, self.stopped = state, False
@@ -127,18 +126,18 @@ class Loop(Generic[Shown]):
         self.start, self.join = self._thread.start, self._thread.join
 
     def submit(self, change: Callable[[Shown], Shown]) -> None:
-        """Have a change applied before the next picture."""
+        """Queue a change that is applied before the next picture."""
         with self._wake:
             self._changes.append(change)
             self._wake.notify()
 
     @property
     def is_superseded(self) -> bool:
-        """Whether a change waits: a picture of the state as it is would be old before it is seen."""
+        """Whether a change is queued, so that a picture of the current state would be outdated."""
         return bool(self._changes) or self.stopped
 
     def stop(self) -> None:
-        """End the thread after the picture that it draws, without waiting: that may be a browser's callback."""
+        """End the thread after its current picture, without waiting: the caller may be a browser's callback."""
         with self._wake:
             self.stopped = True
             self._wake.notify()
@@ -173,7 +172,7 @@ ONE_LIGHT = "This network knows the light of its training alone; `--run surfels`
 
 
 class Browser:
-    """Its controls, and the loop that draws for it; `network` keeps two from drawing at once, `reading` reads files."""
+    """One browser: controls and render loop; `network` is a lock on rendering, `reading` are options for files."""
 
     def __init__(
         self, client: viser.ClientHandle, model: Model, first: State, reading: dict[str, Any], network: threading.Lock
@@ -183,7 +182,7 @@ class Browser:
         self.loop = Loop(first, self._draw)
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
-        self._said = gui.add_markdown(PREPARING)
+        self._status = gui.add_markdown(PREPARING)
         with gui.add_folder("Picture"):
             self._add_picture(gui)
         with gui.add_folder("Light"):
@@ -199,9 +198,9 @@ class Browser:
         self.loop.start()
 
     def _look(self, camera: viser.CameraHandle) -> None:
-        seen = frame.read_view(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
-        if seen is not None:
-            self._replace(view=seen)
+        view = frame.read_view(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
+        if view is not None:
+            self._replace(view=view)
 
     def _draw(self, state: State, moving: bool) -> None:
         with self._network:
@@ -209,7 +208,7 @@ class Browser:
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
-            self._said.content = self._said.content.replace(PREPARING, "")
+            self._status.content = self._status.content.replace(PREPARING, "")
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))
@@ -218,12 +217,12 @@ class Browser:
         self.loop.submit(lambda state: frame.relight(state, lighting))
 
     def _try(self, work: Callable[[], None]) -> None:
-        """Do the work of a control; what a person can mend becomes a note in the browser."""
+        """Run the callback of a control; errors that the user can fix become a notification."""
         try:
             work()
         except (ValueError, OSError) as error:
-            said = " ".join(str(error).split())[:LONGEST_NOTE]
-            self._client.add_notification("That did not work", said, auto_close_seconds=10, color="red")
+            message = " ".join(str(error).split())[:LONGEST_NOTE]
+            self._client.add_notification("That did not work", message, auto_close_seconds=10, color="red")
 
     def _add_picture(self, gui: viser.GuiApi) -> None:
         names, hint = tuple(frame.qualities(self._model)), "While things move: draft, half the pixels"
@@ -248,8 +247,8 @@ class Browser:
 
         async def move(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself chooses a new map
-                said = {name: control.value for name, control in self._light.items()}
-                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **said)))
+                message = {name: control.value for name, control in self._light.items()}
+                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **message)))
 
         for control in self._light.values():
             control.on_update(move)
@@ -297,7 +296,7 @@ class Browser:
 
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-EYE = (1.7, 1.2, 2.9)  # in the box: where a browser looks from at first, at its middle
+EYE = (1.7, 1.2, 2.9)  # initial camera position in the box; it looks at the middle
 EXPOSED = (
     "--host {host}: whoever reaches this machine on port {port} and knows the token of the address sees {name}, can "
     "send files that this process reads, and makes it compute; there is no encryption: who listens reads the token"
@@ -313,7 +312,7 @@ class Server(viser.ViserServer):
 
 
 class Viewer:
-    """A running server; `url` is its page, with the token, `lines` what a person should know about it."""
+    """A running server; `url` is its page, with the token; `lines` are messages for the user."""
 
     def __init__(
         self, model: Model, first: State, reading: dict[str, Any], host: str, port: int, reached_at: str | None = None
@@ -323,7 +322,10 @@ class Viewer:
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
         token = new_token()
-        with guard(token, reached_at) as opened, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
+        with (
+            require_token(token, reached_at) as opened,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # no banner of viser
             self._server = Server(host=host, port=port, label="spnr view", verbose=False)
         if not opened:
             self.stop()
@@ -345,7 +347,7 @@ class Viewer:
             self.stop()
 
     def stop(self) -> None:
-        """Close the server and end what draws."""
+        """Close the server and end the render loops."""
         for browser in tuple(self._browsers.values()):
             browser.loop.stop()
         with contextlib.redirect_stdout(io.StringIO()):
@@ -361,7 +363,7 @@ class Viewer:
         self._server.on_client_disconnect(self._disconnect)
 
     def _warm_up(self) -> None:
-        """Compile what the first browser will ask for while it still loads the page."""
+        """Compile the first browser's programs while it loads the page."""
         state = dataclasses.replace(self._first, view=frame.read_view((0, 1, 0, 0), (0, 0, 3), 1.0, 64, 64))
         for moving in (True, False):
             with self._network:
@@ -375,16 +377,16 @@ class Viewer:
             browser.loop.stop()
 
 
-def open_viewer(asked: View) -> tuple[Viewer, list[str]]:
-    """The running viewer of a command, and what was assumed about its file, a line each; ValueError for a bad file."""
-    _check_free(asked.host, asked.port)  # before the seconds that reading takes
-    model = load(asked.run)
-    check_takes_light(model, asked.lighting.is_given, asked.run)
+def open_viewer(command: View) -> tuple[Viewer, list[str]]:
+    """The running viewer of a command, and the assumptions about its file; ValueError for a bad file."""
+    _check_free(command.host, command.port)  # before the seconds that reading takes
+    model = load(command.run)
+    check_takes_light(model, command.lighting.is_given, command.run)
     notes: list[str] = []
-    reading: dict[str, Any] = {"num_points": asked.num_points, "up": asked.up, "clean": asked.clean}
-    points = clouds.read_cloud(asked.cloud, **reading, cut=asked.cut, report=notes.append)
-    first = frame.open_state(model, points, frame.display_name(asked.cloud.name), asked.lighting)
-    return Viewer(model, first, reading, asked.host, asked.port, asked.reached_at), notes
+    reading: dict[str, Any] = {"num_points": command.num_points, "up": command.up, "clean": command.clean}
+    points = clouds.read_cloud(command.cloud, **reading, cut=command.cut, report=notes.append)
+    first = frame.open_state(model, points, frame.display_name(command.cloud.name), command.lighting)
+    return Viewer(model, first, reading, command.host, command.port, command.reached_at), notes
 
 
 def _check_free(host: str, port: int) -> None:

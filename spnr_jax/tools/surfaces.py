@@ -47,9 +47,9 @@ def draw_around(model: Model, volume: Volume, light: Light | None, count: int, r
     """The network's pictures from even directions, from the top down along a spiral; the cameras are in the box."""
     heights = 1 - (2 * np.arange(count) + 1) / count
     angles = zip(np.arange(count) * GOLDEN_ANGLE % 360, np.degrees(np.arcsin(heights)), strict=True)
-    places = [model.camera(volume, float(azimuth), float(height), resolution) for azimuth, height in angles]
+    viewpoints = [model.camera(volume, float(azimuth), float(height), resolution) for azimuth, height in angles]
     found, centre, scale = [], np.asarray(volume.centre), np.asarray(volume.scale)
-    for camera, drawn in zip(places, model.render_each(volume, places, lights=[light] * count), strict=True):
+    for camera, drawn in zip(viewpoints, model.render_each(volume, viewpoints, lights=[light] * count), strict=True):
         image, opacity = np.asarray(drawn.image), np.asarray(drawn.acc)
         depth = surface_depth(drawn, camera, volume) * scale
         times = len(image) // len(opacity)  # of a network that enlarges its pictures
@@ -86,7 +86,7 @@ def splats(
         inside = np.clip((np.asarray(cloud.positions) - centre) * scale, -1, 1).astype(np.float32)
         scene = encode_in_box(dataclasses.replace(cloud, positions=inside))
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])
-    seen = gaussians.collect_surface(pictures, scene.surfels)
-    grey, side = gaussians.place(seen, most=most, pixel=DISTANCE / focal)
-    made = jax.tree.map(np.asarray, gaussians.color(grey, pictures, side=side, degree=degree))
-    return made.replace(position=made.position / scale + centre, scale=made.scale / scale)
+    surface = gaussians.collect_surface(pictures, scene.surfels)
+    grey, side = gaussians.place_splats(surface, most=most, pixel=DISTANCE / focal)
+    splatted = jax.tree.map(np.asarray, gaussians.color_splats(grey, pictures, side=side, degree=degree))
+    return splatted.replace(position=splatted.position / scale + centre, scale=splatted.scale / scale)

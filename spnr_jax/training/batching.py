@@ -3,7 +3,7 @@
 A batch depends only on the step, so the step number is the state of the reader: a resumed run gets the same data,
 whatever was read ahead.
 
-Faults are noise, outliers, unseen surface, uneven density, colours without materials.  Their functions take and return
+Faults are noise, outliers, hidden surface, uneven density, colours without materials.  Their functions take and return
 (positions (n, 3), other columns by name) with a generator of random numbers.  Lengths are in units of the box whose
 half diagonal is 1; the points must lie in it.  `random_scan` draws several.
 """
@@ -25,14 +25,17 @@ from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData, has_lights, on_white
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Batch, Camera, Light, PointCloud
-from spnr_jax.surfels.normals import find_visible, spacing_of
+from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 # --- batches ----------------------------------------------------------------------------------------------------------
 
 
 CACHE_BYTES = 2**31  # decoded objects kept in memory
 READERS, READ_AHEAD = 2, 4  # threads that assemble batches, and batches ready or in work
-ORDER, POINTS_AND_VIEWS = 1, 2  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
+ORDER_STREAM, SAMPLE_STREAM = (
+    1,
+    2,
+)  # streams of random numbers under one seed: (0, 5) and (0, 5, 0) alone would be the same
 
 
 def choose_points(
@@ -52,10 +55,10 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
     """The training batch of these objects at this step: random points and random views of each."""
     clouds_of, views_of = [], []
     for i, item in enumerate(objects):
-        generator = np.random.default_rng((config.seed, POINTS_AND_VIEWS, step, i))
+        generator = np.random.default_rng((config.seed, SAMPLE_STREAM, step, i))
         low, high = np.log2(config.min_points), np.log2(config.max_points)
         count = round(2 ** generator.uniform(low, high))
-        cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them, if they need any
+        cloud = dataclasses.replace(item.cloud, normals=None)  # networks of whole views estimate them if needed
         clouds_of.append(choose_points(cloud, count, config.max_points, generator, config.even_share))
         chosen = generator.permutation(len(item.images))[: config.views_per_object]
         camera = item.camera.cam_to_world, item.camera.intrinsics
@@ -76,14 +79,14 @@ def make_batch(objects: list[ObjectData], config: TrainConfig, step: int) -> Bat
 def object_names(names: tuple[str, ...], config: TrainConfig, step: int) -> list[str]:
     """The objects of a step: consecutive pieces of one new permutation of all objects per epoch."""
     positions = range(step * config.batch_objects, (step + 1) * config.batch_objects)
-    places = (divmod(position, len(names)) for position in positions)
-    return [names[epoch_order(config.seed, epoch, len(names))[place]] for epoch, place in places]
+    slots = (divmod(position, len(names)) for position in positions)
+    return [names[epoch_order(config.seed, epoch, len(names))[slot]] for epoch, slot in slots]
 
 
 @functools.lru_cache(maxsize=4)  # one batch spans few epochs, and a million objects take 20 ms to permute
 def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
     """The permutation (count,) of all objects in an epoch."""
-    return np.random.default_rng((seed, ORDER, epoch)).permutation(count)
+    return np.random.default_rng((seed, ORDER_STREAM, epoch)).permutation(count)
 
 
 def prepare(
@@ -123,7 +126,7 @@ def batches(
 
 
 def read_ahead(assemble: Callable[[int], Any], first_step: int, config: TrainConfig) -> Generator[Any, None, None]:
-    """What `assemble` makes of each step, some steps ahead in threads, which end with this generator."""
+    """Results of `assemble` for each step, computed ahead in threads, which end with this generator."""
     steps = range(first_step, config.num_steps)
     yield from run_ahead((functools.partial(assemble, step) for step in steps), READERS, READ_AHEAD)
 
@@ -163,21 +166,21 @@ Points = tuple[np.ndarray, dict[str, np.ndarray]]
 Fault = Callable[[np.ndarray, dict[str, np.ndarray], np.random.Generator], Points]
 
 SCANNER = 2.5  # distance of a virtual scanner from the middle of the box
-BEHIND = 3.0  # spacings behind the first of its pixel that a scanner still sees a point
-BALLS = 0.03, 0.15  # radii of what is left out
-SHADED = 0.2, 0.7  # of a colour that a lamp's direction takes away at most
+BEHIND = 3.0  # spacings behind the first point of a pixel within which points are visible
+BALLS = 0.03, 0.15  # radii of holes
+SHADED = 0.2, 0.7  # largest share of a colour that shading removes
 NOISE, OUTLIERS = (0.001, 0.02), (0.002, 0.05)  # of random scans, drawn from the logarithm
-MISREGISTERED, COLOUR_NOISE = 0.004, 0.08  # at most
+MISREGISTERED, COLOR_NOISE = 0.004, 0.08  # at most
 THINNEST = 0.1  # density at one end of a cloud of uneven density, over that at the other
 
 
-def noisy(positions, values, rng, *, sigma: float) -> Points:
+def add_noise(positions, values, rng, *, sigma: float) -> Points:
     """Normally distributed errors of this standard deviation along each axis."""
     return positions + sigma * rng.normal(size=positions.shape), values
 
 
-def with_outliers(positions, values, rng, *, share: float) -> Points:
-    """So many more points, uniform in the bounding box, with the columns of points drawn at random."""
+def add_outliers(positions, values, rng, *, share: float) -> Points:
+    """A share of outliers, uniform in the bounding box, with the columns of random points."""
     count = round(share * len(positions))
     low, high = positions.min(axis=0), positions.max(axis=0)
     copied = rng.integers(len(positions), size=count)
@@ -187,36 +190,36 @@ def with_outliers(positions, values, rng, *, share: float) -> Points:
     )
 
 
-def scan(positions, values, rng, *, scanners: int) -> Points:
-    """What scanners in random directions from the middle see."""
-    spacing, seen = spacing_of(positions), np.zeros(len(positions), bool)
+def simulate_scanners(positions, values, rng, *, scanners: int) -> Points:
+    """The points that scanners in random directions see."""
+    spacing, visible = measure_spacing(positions), np.zeros(len(positions), bool)
     for direction in rng.normal(size=(scanners, 3)):
-        seen |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
-    return positions[seen], {name: column[seen] for name, column in values.items()}
+        visible |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
+    return positions[visible], {name: column[visible] for name, column in values.items()}
 
 
 def misregister(positions, values, rng, *, sigma: float) -> Points:
-    """Two scans that do not quite meet: the points on one side of a random plane are moved together."""
+    """Two misaligned scans: the points on one side of a random plane are shifted together."""
     apart = positions @ rng.normal(size=3) > 0
     return positions + apart[:, None] * sigma * rng.normal(size=3), values
 
 
 def drop_balls(positions, values, rng, *, balls: int) -> Points:
-    """Nothing is left in balls around random points."""
+    """The points outside of balls around random points."""
     middles, radii = positions[rng.integers(len(positions), size=balls)], rng.uniform(*BALLS, balls)
     kept = (((positions[:, None] - middles) ** 2).sum(axis=-1) > radii**2).all(axis=1)
     kept[0] = True
     return positions[kept], {name: column[kept] for name, column in values.items()}
 
 
-def colour_noise(positions, values, rng, *, sigma: float) -> Points:
+def add_color_noise(positions, values, rng, *, sigma: float) -> Points:
     """Normally distributed errors of the base colours."""
     color = values["base_color"]
     return positions, values | {"base_color": np.clip(color + sigma * rng.normal(size=color.shape), 0, 1)}
 
 
-def colours_in_light(positions, values, rng) -> Points:
-    """Base colours darkened as a lamp in a grey room would, as a photograph has them; as they are without normals."""
+def bake_light(positions, values, rng) -> Points:
+    """Base colours shaded by a lamp, as in a photograph; unchanged without normals."""
     if "normals" not in values:
         return positions, values
     lamp = rng.normal(size=3)
@@ -225,32 +228,32 @@ def colours_in_light(positions, values, rng) -> Points:
     return positions, values | {"base_color": values["base_color"] * shade[:, None]}
 
 
-def colours_alone(positions, values, rng) -> Points:
-    """Roughness 0.5 and metallic 0 everywhere and not known, as a file without materials is read."""
+def drop_materials(positions, values, rng) -> Points:
+    """Roughness 0.5 and metallic 0, both unknown, as in a file without materials."""
     flat = {"roughness": 0.5, "metallic": 0.0, "materials_known": 0.0}
     return positions, values | {name: np.full(len(positions), x, np.float32) for name, x in flat.items()}
 
 
-def uneven(positions, values, rng) -> Points:
-    """A density that falls exponentially in a random direction, to THINNEST."""
+def thin_unevenly(positions, values, rng) -> Points:
+    """Density that falls exponentially along a random direction, to THINNEST."""
     along = positions @ rng.normal(size=3)
-    place = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
-    kept = rng.uniform(size=len(positions)) < THINNEST**place
+    fraction = (along - along.min()) / max(float(np.ptp(along)), np.finfo(np.float64).tiny)
+    kept = rng.uniform(size=len(positions)) < THINNEST**fraction
     kept[0] = True
     return positions[kept], {name: column[kept] for name, column in values.items()}
 
 
 SCANS: tuple[tuple[float, Callable[[np.random.Generator], Fault]], ...] = (
     # of a random scan: the chance of each fault, and how it is drawn
-    (0.15, lambda rng: colours_in_light),
-    (0.4, lambda rng: functools.partial(scan, scanners=int(rng.integers(3, 9)))),
-    (0.2, lambda rng: uneven),
+    (0.15, lambda rng: bake_light),
+    (0.4, lambda rng: functools.partial(simulate_scanners, scanners=int(rng.integers(3, 9)))),
+    (0.2, lambda rng: thin_unevenly),
     (0.15, lambda rng: functools.partial(drop_balls, balls=int(rng.integers(1, 5)))),
     (0.15, lambda rng: functools.partial(misregister, sigma=rng.uniform(0, MISREGISTERED))),
-    (0.75, lambda rng: functools.partial(noisy, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
-    (0.35, lambda rng: functools.partial(with_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
-    (0.5, lambda rng: functools.partial(colour_noise, sigma=rng.uniform(0, COLOUR_NOISE))),
-    (0.5, lambda rng: colours_alone),
+    (0.75, lambda rng: functools.partial(add_noise, sigma=float(np.exp(rng.uniform(*np.log(NOISE)))))),
+    (0.35, lambda rng: functools.partial(add_outliers, share=float(np.exp(rng.uniform(*np.log(OUTLIERS)))))),
+    (0.5, lambda rng: functools.partial(add_color_noise, sigma=rng.uniform(0, COLOR_NOISE))),
+    (0.5, lambda rng: drop_materials),
 )
 
 

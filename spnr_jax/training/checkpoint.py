@@ -28,8 +28,8 @@ KEPT = 3  # newest checkpoints that stay
 
 
 @contextmanager
-def alone(run: Path) -> Iterator[None]:
-    """While it lasts no other process trains in the run folder, which is made; ValueError if one does already.
+def lock_run(run: Path) -> Iterator[None]:
+    """Locks the run folder, which is created, for training; ValueError if another process trains in it.
 
     The operating system releases the lock when the process exits, however it exits.
     """
@@ -60,7 +60,7 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
     changed = []
-    for name in (name for name in wanted if name in stored):  # of another method the name says it all
+    for name in (name for name in wanted if name in stored):  # fields of another method are not compared
         old, value = stored[name], wanted[name]
         if isinstance(value, dict):
             changed += _differences(old, value, f"{path}{name}.")
@@ -83,8 +83,8 @@ def read_config(run: Path | str) -> TrainConfig:
 
 
 def _checkpointer(run: Path, *, writing: bool):
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # a line each save, call stacks of what is raised as well
-    from orbax.checkpoint import v1 as ocp  # two seconds of import that rendering from Python need not pay
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # silences a line per save, and call stacks of errors
+    from orbax.checkpoint import v1 as ocp  # imported here: it takes two seconds
 
     return ocp.training.Checkpointer(
         (run / "checkpoints").absolute(),
@@ -94,11 +94,11 @@ def _checkpointer(run: Path, *, writing: bool):
 
 
 def save(run: Path, state: optimisation.TrainState) -> None:
-    """Writes the state as the run's newest checkpoint and removes those that are too old; ValueError if it cannot."""
+    """Writes the state as the run's newest checkpoint and removes old ones; ValueError if that fails."""
     step = int(state.step)
     try:
         with _checkpointer(run, writing=True) as checkpointer:
-            # a damaged checkpoint of this step, which an earlier run left, makes place
+            # overwrites a damaged checkpoint of this step from an earlier run
             checkpointer.save(step, state, force=True, overwrite=True)
     except (OSError, ValueError) as error:  # tensorstore raises ValueError for the disk's errors, too
         number = re.search(r"os_error_code='(\d+)'", str(error))
@@ -107,7 +107,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
             f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
             "this, and the same command goes on from there"
         ) from None
-    runtime.give_back()
+    runtime.trim_memory()
 
 
 def restore(
@@ -118,7 +118,7 @@ def restore(
 ) -> optimisation.TrainState | None:
     """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint.
 
-    The state lies where `sharding` says, by default on the first device, wherever it lay when it was saved.
+    The state is placed by `sharding`, by default on the first device.
     """
     folder = run / "checkpoints"
     if not folder.is_dir():

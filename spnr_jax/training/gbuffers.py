@@ -39,28 +39,32 @@ from spnr_jax.method.inference import reconstruction_loss
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import Shader, picture
+from spnr_jax.nn.shader import Shader, compose_picture
 from spnr_jax.surfels import lighting, normals
-from spnr_jax.training.batching import colours_alone, random_scan, read_ahead
+from spnr_jax.training.batching import drop_materials, random_scan, read_ahead
 from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # per object
 SCANNED = 0.3  # share of the clouds that are simulated scans, cleaned
 UNKNOWN_MATERIALS = 0.1  # share of the other clouds whose roughness and metallic are unknown
 WITHOUT_NORMALS = 0.5  # share of the other clouds without given normals
-ALONE = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
+OWN_NORMALS = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # a view averages side x side pixels of its reference; drawn from these
 SMALL, FEWER = 4, 8  # from this side on, a cloud has at most 1 / FEWER of the points
 MOST_ENTRIES = 2**22  # of a view: one with more is dropped
-LEAST = 8  # least pixels along the shorter side of a view
+LEAST_PIXELS = 8  # least pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel belongs to it
 SIZES = (96, 72, 48, 48, 32)  # pixels along a crop, by doublings; scaled if config.crop is not the first
 MARGINS = (0, 4, 8, 14, 10)  # pixels on each side of a crop that are input but not output, by doublings
 SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
-TRIES, COVERED, DRAWN = 4, 0.15, 0.02  # positions tried for a crop, until so large a share of it has this opacity
-LARGEST = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
+TRIES, LEAST_COVERED, VISIBLE_OPACITY = (
+    4,
+    0.15,
+    0.02,
+)  # positions tried for a crop, until so large a share of it has this opacity
+LARGEST_FLOAT16 = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
 LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it is 0
-CLOUD, CROP = 3, 4  # random streams under one seed, in addition to those of `batching`
+CLOUD_STREAM, CROP_STREAM = 3, 4  # random streams under one seed, in addition to those of `batching`
 
 ROOM = "procedural room"  # its name in data sets
 
@@ -81,11 +85,11 @@ def prepare(
 ) -> Callable[[int], Generator[Crops, None, None]]:
     """A function from a step to the training batches from there on.  Missing G-buffers are made first (slow)."""
     variables = add_companions(config.model, {}, run)
-    views = complete(dataset, light or light_of(dataset), config, run / "gbuffers", variables)
+    views = make_missing(dataset, light or choose_light(dataset), config, run / "gbuffers", variables)
     return lambda first_step: batches(views, config, first_step)
 
 
-def light_of(dataset: Dataset) -> Light:
+def choose_light(dataset: Dataset) -> Light:
     """The light of a data set without a light per view; ValueError if it is not the room."""
     described = dataset.settings.get("environment_map")
     name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
@@ -104,8 +108,8 @@ def loss(
     assert isinstance(config.model, SurfelConfig)
     shader = Shader(config.model.widths, config.model.top)
     params = {"params": variables["params"]}
-    outputs: Any = shader.apply(params, jnp.asarray(crops.seen), crops.doublings, crops.margin)
-    color, alpha = picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
+    outputs: Any = shader.apply(params, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
+    color, alpha = compose_picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
     image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
@@ -124,7 +128,7 @@ def loss(
     )
 
 
-def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
+def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
     """The views of the data set; missing and broken files are made first; `variables` hold the densifier."""
     views = []
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
@@ -134,7 +138,7 @@ def complete(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, 
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
                 programs.make_room()
-                arrays = make(item, number, light, config, variables)
+                arrays = make_views(item, number, light, config, variables)
                 write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
@@ -152,9 +156,9 @@ def _doublings(path: Path) -> list[int] | None:
         return None
 
 
-def make(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
+def make_views(item: ObjectData, number: int, light: Light, config: TrainConfig, variables: dict) -> Arrays:
     """The content of a file: views of the object's cloud with this index."""
-    generator = np.random.default_rng((config.seed, CLOUD, zlib.crc32(item.name.encode()), number))
+    generator = np.random.default_rng((config.seed, CLOUD_STREAM, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
     scene = encode_in_box(surfel_method.densify_sparse(variables, cloud))
@@ -176,24 +180,24 @@ def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: n
     even = generator.random() < config.even_share and count <= MOST_EVEN
     columns = {name: np.asarray(x) for name, x in vars(cloud).items() if x is not None and name != "mask"}
     points = Cleaned(columns.pop("positions"), columns, [], 0.0)
-    alone = False
+    own_normals = False
     if generator.random() < SCANNED:
-        points, count = scan(points, generator), min(count, MOST_EVEN)
+        points, count = simulate_scan(points, generator), min(count, MOST_EVEN)
     else:
         if generator.random() < UNKNOWN_MATERIALS:
-            points = points._replace(values=colours_alone(*points[:2], generator)[1])
+            points = points._replace(values=drop_materials(*points[:2], generator)[1])
         if generator.random() < WITHOUT_NORMALS:
-            alone = generator.random() < ALONE
-            if not alone:
+            own_normals = generator.random() < OWN_NORMALS
+            if not own_normals:
                 points.values.pop("normals", None)
     chosen = generator.permutation(len(points.positions))[:count]
     if even:
         chosen = farthest_points(points.positions, len(chosen), int(chosen[0]))
     cloud = normals.thin_cloud(points, chosen)
-    return dataclasses.replace(cloud, normals=None) if alone else cloud
+    return dataclasses.replace(cloud, normals=None) if own_normals else cloud
 
 
-def scan(points: Cleaned, generator: np.random.Generator) -> Cleaned:
+def simulate_scan(points: Cleaned, generator: np.random.Generator) -> Cleaned:
     """A simulated scan of the cloud, cleaned: without normals, in the box of the original cloud."""
     positions, values = random_scan(*points[:2], generator)
     values.pop("normals", None)
@@ -210,42 +214,42 @@ def make_view(
 ) -> tuple[int, Arrays] | None:
     """Doublings and arrays of a view with `side` times fewer pixels along a side; None if it shows too little."""
     small = cameras.resize(camera, camera.height // side, camera.width // side)
-    doublings, finer = surfel_renderer.resolution(scene, small)
+    doublings, finer = surfel_renderer.choose_resolution(scene, small)
     # drawn at twice the size, it is compared at that size, or at the reference's if that has no more pixels
     side, scale = max(side // finer, 1), 2**doublings
-    if any(n % (side * scale) or n // (side * scale) < LEAST for n in image.shape[:2]):
+    if any(n % (side * scale) or n // (side * scale) < LEAST_PIXELS for n in image.shape[:2]):
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
     needed = jax.device_get(surfel_renderer.count_sizes(scene, drawn, doublings=0, side=1))
     if not 0 < needed.entries <= MOST_ENTRIES:
         return None
     whole = drawn.height * drawn.width
-    room, slots = _size(int(needed.entries), 2**16), min(_size(int(needed.slots), whole // 16), whole)
-    seen, maps, ambient = map(np.asarray, prepare_view(scene.surfels, drawn, light, room=room, slots=slots))
+    capacity, slots = _round_size(int(needed.entries), 2**16), min(_round_size(int(needed.slots), whole // 16), whole)
+    inputs, maps, ambient = map(np.asarray, prepare_view(scene.surfels, drawn, light, capacity=capacity, slots=slots))
     target = average_squares(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
-    inside = (seen[..., 0] > FAINT) | (shown > 0)
+    inside = (inputs[..., 0] > FAINT) | (shown > 0)
     if not inside.any():
         return None
-    rows, columns = _around(inside.any(axis=1)), _around(inside.any(axis=0))
+    rows, columns = _find_bounds(inside.any(axis=1)), _find_bounds(inside.any(axis=0))
     return doublings, {
-        "seen": seen[rows, columns].astype(np.float16),
-        "maps": np.clip(maps[rows, columns], -LARGEST, LARGEST).astype(np.float16),
+        "seen": inputs[rows, columns].astype(np.float16),
+        "maps": np.clip(maps[rows, columns], -LARGEST_FLOAT16, LARGEST_FLOAT16).astype(np.float16),
         "ambient": ambient,
         "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
     }
 
 
-@partial(jax.jit, static_argnames=("room", "slots"))
+@partial(jax.jit, static_argnames=("capacity", "slots"))
 def prepare_view(
-    surfels: Surfels, camera: Camera, light: Light, *, room: int, slots: int
+    surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
     """Network input for a whole view, light maps, and spherical harmonics of the light."""
-    buffer, _ = surfel_renderer.rasterize(surfels, camera, light, room=room, slots=slots)
+    buffer, _ = surfel_renderer.rasterize(surfels, camera, light, capacity=capacity, slots=slots)
     return surfel_renderer.prepare_inputs(buffer, light, camera)[:3]
 
 
-def _size(count: int, least: int) -> int:
+def _round_size(count: int, least: int) -> int:
     """The least `least` times a power of four that is not below the count: few sizes, few compilations."""
     return least * 4 ** max(-(-((count - 1) // least).bit_length() // 2), 0)
 
@@ -259,7 +263,7 @@ def average_squares(image: UInt8[np.ndarray, "height width 4"], side: int) -> UI
     return to_uint8(np.concatenate([means[..., :3] / np.maximum(means[..., 3:], 1e-4), means[..., 3:]], axis=-1))
 
 
-def _around(inside: np.ndarray) -> slice:
+def _find_bounds(inside: np.ndarray) -> slice:
     """From the first to the last True entry, with a margin."""
     first, last = np.flatnonzero(inside)[[0, -1]].tolist()
     return slice(max(first - MARGIN, 0), min(last + 1 + MARGIN, len(inside)))
@@ -276,7 +280,7 @@ def batches(views: list[View], config: TrainConfig, first_step: int) -> Generato
 
 def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:
     """The batch of a step: crops of random views with equal doublings, randomly mirrored."""
-    generator = np.random.default_rng((config.seed, CROP, step))
+    generator = np.random.default_rng((config.seed, CROP_STREAM, step))
     shares = np.array([SHARES[doublings] for doublings in sorted(views)])
     doublings = int(generator.choice(sorted(views), p=shares / shares.sum()))
     size, margin = (-(-config.crop * n[doublings] // SIZES[0]) for n in (SIZES, MARGINS))
@@ -288,7 +292,7 @@ def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> 
             crop = mirror(crop, axis) if generator.random() < 0.5 else crop
         crops.append(crop)
     stacked = {name: np.stack([crop[name] for crop in crops]) for name in NAMES}
-    return Crops(**stacked, doublings=doublings, margin=margin)
+    return Crops(inputs=stacked.pop("seen"), **stacked, doublings=doublings, margin=margin)
 
 
 def read_view(view: View) -> Arrays:
@@ -303,21 +307,21 @@ def read_view(view: View) -> Arrays:
 
 def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
     """A crop of a view that shows some of the object; padded with zeros beyond the view."""
-    seen, inner = view["seen"], size - 2 * margin
+    inputs, inner = view["seen"], size - 2 * margin
     for _ in range(TRIES):
-        top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in seen.shape[:2])
-        if np.mean(seen[top : top + inner, left : left + inner, 0] > DRAWN) > COVERED:
+        top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in inputs.shape[:2])
+        if np.mean(inputs[top : top + inner, left : left + inner, 0] > VISIBLE_OPACITY) > LEAST_COVERED:
             break
 
     def cut(values: np.ndarray, margin: int, scale: int) -> np.ndarray:
-        places = [(scale * (first - margin), scale * (first + inner + margin)) for first in (top, left)]
-        rows, columns = (slice(max(first, 0), max(end, 0)) for first, end in places)
+        bounds = [(scale * (first - margin), scale * (first + inner + margin)) for first in (top, left)]
+        rows, columns = (slice(max(first, 0), max(end, 0)) for first, end in bounds)
         part = values[rows, columns]
-        lacking = [(max(-f, 0), max(e - n, 0)) for (f, e), n in zip(places, values.shape, strict=False)]
+        lacking = [(max(-f, 0), max(e - n, 0)) for (f, e), n in zip(bounds, values.shape, strict=False)]
         return np.pad(part, [*lacking, (0, 0)])
 
     return {
-        "seen": cut(seen, margin, 1).astype(np.float32),
+        "seen": cut(inputs, margin, 1).astype(np.float32),
         "maps": cut(view["maps"], 0, 1).astype(np.float32),
         "ambient": view["ambient"],
         "target": cut(view["target"], 0, scale),

@@ -24,7 +24,7 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.records import AnyArray, Batch, Key
 from spnr_jax.methods import method_of
 
-Judge = tuple[dict, tuple]  # parameters and optimiser state of the discriminator
+DiscriminatorState = tuple[dict, tuple]  # parameters and optimiser state of the discriminator
 
 
 @no_type_check
@@ -76,8 +76,8 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
     discriminator = None
     if first_adversarial_step(config) < config.num_steps:
         image = jnp.zeros((1, *[config.model.image_resolution] * 2, 3))
-        judge = discriminator_of(config)
-        discriminator = judge.init(discriminator_key, image, image, image[..., 0] > 0)["params"]
+        module = discriminator_of(config)
+        discriminator = module.init(discriminator_key, image, image, image[..., 0] > 0)["params"]
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
@@ -162,10 +162,10 @@ def flatten_views(x: AnyArray) -> AnyArray:
 
 
 def discriminator_step(
-    config: TrainConfig, judge: Judge, fake: AnyArray, batch: Batch, step: Array
-) -> tuple[Judge, dict[str, Array]]:
+    config: TrainConfig, adversary: DiscriminatorState, fake: AnyArray, batch: Batch, step: Array
+) -> tuple[DiscriminatorState, dict[str, Array]]:
     """The discriminator and its optimiser after one step on references and renderings, and its metrics."""
-    params, optimizer = judge
+    params, optimizer = adversary
     gradient, metrics = jax.grad(partial(discriminator_loss, config), has_aux=True)(params, fake, batch, step)
     update, optimizer = optimizers(config)[1].update(gradient, optimizer)
     return (optax.apply_updates(params, update), optimizer), metrics
@@ -175,20 +175,26 @@ def discriminator_step(
 
 
 def total_loss(
-    config: TrainConfig, params: dict, stats: dict, judge: Judge | None, batch: Any, key: Key, step: Array
-) -> tuple[Float[Array, ""], tuple[dict[str, Array], dict, Judge | None]]:
-    """(loss, (metrics, statistics, judge)): the method's loss, plus that of the discriminator after its step."""
+    config: TrainConfig,
+    params: dict,
+    stats: dict,
+    adversary: DiscriminatorState | None,
+    batch: Any,
+    key: Key,
+    step: Array,
+) -> tuple[Float[Array, ""], tuple[dict[str, Array], dict, DiscriminatorState | None]]:
+    """(loss, (metrics, statistics, adversary)): the method's loss, plus that of the discriminator after its step."""
     variables = {"params": params, "batch_stats": stats}
     value, outcome = method_of(config.model).loss(variables, batch, key, config=config)
     metrics = outcome.metrics
-    if judge is not None:
+    if adversary is not None:
         fake = flatten_views(outcome.image)
-        judge, more = discriminator_step(config, judge, jax.lax.stop_gradient(fake), outcome.batch, step)
+        adversary, more = discriminator_step(config, adversary, jax.lax.stop_gradient(fake), outcome.batch, step)
         condition = (flatten_views(x) for x in (outcome.batch.condition, outcome.batch.condition_mask))
-        fake_logits = logits(config, judge[0], fake, *condition)
+        fake_logits = logits(config, adversary[0], fake, *condition)
         value = value + config.loss.adversarial_weight * losses.generator_adversarial(fake_logits)
         metrics = metrics | more
-    return value, (metrics, stats if outcome.statistics is None else outcome.statistics, judge)
+    return value, (metrics, stats if outcome.statistics is None else outcome.statistics, adversary)
 
 
 def train_step(
@@ -196,19 +202,19 @@ def train_step(
 ) -> tuple[TrainState, dict[str, Array]]:
     """State after one step of the network, and of the discriminator on the same forward pass; and scalar metrics."""
     key = jax.random.fold_in(state.key, state.step)
-    judge = (state.discriminator, state.discriminator_optimizer) if adversarial else None
+    adversary = (state.discriminator, state.discriminator_optimizer) if adversarial else None
     gradient_of = jax.value_and_grad(partial(total_loss, config), has_aux=True)
     if jax.default_backend() == "cpu":  # under vmap a kernel for each run would be a grouped convolution, slow in XLA
         gradient_of = jax.custom_batching.sequential_vmap(gradient_of)
-    (loss, (metrics, batch_stats, judge)), gradient = gradient_of(
-        state.generator, state.batch_stats, judge, batch, key, state.step
+    (loss, (metrics, batch_stats, adversary)), gradient = gradient_of(
+        state.generator, state.batch_stats, adversary, batch, key, state.step
     )
     update, generator_optimizer = optimizers(config)[0].update(gradient, state.generator_optimizer)
     generator = optax.apply_updates(state.generator, update)
     averaged, averaged_stats = moving_average(
         (state.averaged, state.averaged_stats), (generator, batch_stats), state.step, config.optimizer.ema_decay
     )
-    discriminator, discriminator_optimizer = judge or (state.discriminator, state.discriminator_optimizer)
+    discriminator, discriminator_optimizer = adversary or (state.discriminator, state.discriminator_optimizer)
     state = TrainState(
         step=state.step + 1,
         key=state.key,

@@ -56,9 +56,9 @@ def train(
     A new run starts from random weights, or from `init`.  `mesh` divides batches among devices.  `light` is that of the
     data set's pictures, if it is not the room.
     """
-    runtime.few_arenas()
+    runtime.limit_arenas()
     programs.check_divides(mesh, config.batch_objects)
-    with checkpoint.alone(run), ExitStack() as stack:
+    with checkpoint.lock_run(run), ExitStack() as stack:
         checkpoint.write_config(run, config)
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
@@ -82,7 +82,7 @@ def train(
             if last or done % schedule.preview_every == 0:
                 with log.paused():
                     scores, picture = preview(state, config, dataset, run, light)
-                    runtime.give_back()
+                    runtime.trim_memory()
                 log.write({"step": done, **scores}, picture)
             if last:
                 write_network(run, config, state)
@@ -98,15 +98,15 @@ def take_step(
     state: optimisation.TrainState, batch: Any, config: TrainConfig, mesh: Mesh | None, *, adversarial: bool
 ) -> tuple[optimisation.TrainState, dict]:
     """The state after a batch that is divided among the devices, and metrics."""
-    with programs.using(mesh):
+    with programs.use_mesh(mesh):
         batch = programs.place_batch(batch, mesh)
         return optimisation.jitted_train_step(state, batch, config=config, adversarial=adversarial)
 
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
     """The state to continue from (the newest checkpoint, or before the first step), and a message about it."""
-    with programs.using(mesh):
-        sharding = None if mesh is None else programs.sharding_of_all(mesh)
+    with programs.use_mesh(mesh):
+        sharding = None if mesh is None else programs.replicated_sharding(mesh)
         state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
     if (step := int(state.step)) >= config.num_steps:
         tqdm.write(f"{run} is finished: {step} steps")

@@ -26,39 +26,39 @@ from spnr_jax.formats.point_tables import pack_arrays, read_arrays
 from spnr_jax.method.model import Model
 from spnr_jax.methods import UnknownMethod, from_dict, include, method_of, to_dict
 
-# what a header of any content makes its readers raise
+# errors that readers raise for damaged headers
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 ADVICE = "write one with `spnr export RUN`"
-SHIPPED = "surfels"  # the network of the package, named as its preset
+PACKAGED = "surfels"  # the network of the package, named as its preset
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
-    """A network as evaluation and rendering use it: Linen variables with averaged weights, and where they come from."""
+    """A trained network: Linen variables with averaged weights, config, and number of steps."""
 
     config: TrainConfig
     variables: dict
     steps: int
 
 
-def packaged_file(name: str = SHIPPED) -> Path:
-    """The file of weights that the package holds under a name: its network, or "densifier"."""
+def packaged_file(name: str = PACKAGED) -> Path:
+    """A weights file of the package, by name: its network, or "densifier"."""
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
 def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict:
-    """The variables, and those that the method asks for beside them (its densifier): a folder's own, or the package's.
+    """The variables with those of companion networks (a densifier): from the folder, or else from the package.
 
-    The folder is that of the run, or the one that the file of weights lies in.
+    The folder is the run's, or that of the weights file.
     """
     own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
     files = {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
     return variables | {name: read_variables(path) for name, path in files.items()}
 
 
-def place(source: Path | str | None) -> Path:
+def locate(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
-    return packaged_file() if source is None or str(source) == SHIPPED else Path(source)
+    return packaged_file() if source is None or str(source) == PACKAGED else Path(source)
 
 
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print) -> Trained:
@@ -66,7 +66,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print) 
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint.
     """
-    path = place(source)
+    path = locate(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
         return replace(trained, variables=add_companions(trained.config.model, trained.variables, path.parent))
@@ -78,7 +78,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print) 
 
 
 def read_variables(path: Path) -> dict:
-    """The tree of a file that holds weights alone, float16 by name."""
+    """The variables of a file that contains only weights, float16 by name."""
     with path.open("rb") as file:
         return _as_variables(read_arrays(file))
 
@@ -86,7 +86,7 @@ def read_variables(path: Path) -> dict:
 def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:
     """The network of the package (None, or its name), of a run folder's newest checkpoint, or of a file.
 
-    For a method of one's own, `methods` names the .py file or module that registers it: no file makes it be imported.
+    For your own method, `methods` names the .py file or module that registers it; it is never imported unasked.
     """
     if methods is not None:
         include(methods)
@@ -111,8 +111,8 @@ def write_weights(path: Path, trained: Trained) -> None:
 def read_weights(path: Path) -> Trained:
     """The network of a file, in float32; ValueError that says what is wrong with it.
 
-    That the weights are those of the config's network takes a second to find out, because the network is traced for
-    their shapes; the package's own file is not asked again.
+    The shapes of the weights are compared with the config's network, which takes a second of tracing; this is skipped
+    for the package's own file.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file of weights; {ADVICE}")

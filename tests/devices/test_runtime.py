@@ -63,7 +63,7 @@ import resource, sys
 from spnr_jax.devices import runtime
 
 if sys.argv[1] == "keep":
-    runtime.keep_arrays()
+    runtime.reuse_memory()
 import jax
 
 @jax.jit
@@ -100,11 +100,11 @@ def test_the_c_library_is_asked_for_as_many_arenas_as_cores_and_to_give_freed_me
     )
     monkeypatch.setattr(ctypes, "CDLL", lambda name: glibc if name == "libc.so.6" else None)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    runtime.few_arenas()
-    runtime.give_back()
+    runtime.limit_arenas()
+    runtime.trim_memory()
     assert asked == [("mallopt", runtime.ARENA_MAX, 3), ("malloc_trim", 0)]
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
-    runtime.few_arenas()  # another C library is left alone
+    runtime.limit_arenas()  # another C library is left alone
 
 
 PROGRAM = """
@@ -113,7 +113,7 @@ from spnr_jax.devices import runtime
 os.environ["JAX_COMPILATION_CACHE_DIR"] = sys.argv[1]
 seen = []
 for cut in (True, False, False):
-    runtime.keep_programs()
+    runtime.cache_programs()
     import jax
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.clear_caches()

@@ -32,7 +32,7 @@ def folder(tmp_path):
 
 def kept():
     """As a new process has it."""
-    return programs.Kept(bend, returns=(Rays,), static="times")
+    return programs.CachedProgram(bend, returns=(Rays,), static="times")
 
 
 RAYS = Rays(np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), np.float32))
@@ -83,7 +83,7 @@ def test_inside_other_transformations_it_is_the_function(folder):
 def test_programs_are_dropped_before_the_memory_maps_of_the_process_run_out(folder, monkeypatch):
     """Three maps of each kernel stay until then; what is dropped computes the same when it is called again."""
     cleared = []
-    monkeypatch.setattr(programs.Kept, "all", [])
+    monkeypatch.setattr(programs.CachedProgram, "instances", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))  # the real one slows every test after this
     first, second = kept(), kept()
     close(first(RAYS, SHIFT, times=3), EXPECTED)

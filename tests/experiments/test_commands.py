@@ -54,9 +54,9 @@ def _tiny(monkeypatch):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
     monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": stand_ins.stand_in()})
-    fresh = {weights.SHIPPED: tiny_surfels.untrained()}
+    fresh = {weights.PACKAGED: tiny_surfels.untrained()}
     monkeypatch.setattr(
-        weights, "packaged_file", lambda name=weights.SHIPPED: fresh.get(name) or tiny_surfels.PACKAGED(name)
+        weights, "packaged_file", lambda name=weights.PACKAGED: fresh.get(name) or tiny_surfels.PACKAGED(name)
     )
     monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)

@@ -15,7 +15,7 @@ from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import parse_ply
-from spnr_jax.surfels.gaussians import C0, rotations
+from spnr_jax.surfels.gaussians import C0, rotation_matrices
 
 NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"
 
@@ -37,8 +37,8 @@ def test_a_ply_holds_each_number_of_the_splats_turned_half_around(tmp_path, degr
     np.testing.assert_allclose(found("f_dc_0", "f_dc_1", "f_dc_2"), splats.harmonics[:, 0], atol=1e-6)
     for i in range(3 * rest):  # all of red, then green, then blue
         np.testing.assert_allclose(columns[f"f_rest_{i}"], wanted.harmonics[:, 1 + i % rest, i // rest], atol=1e-6)
-    turns = rotations(found("rot_0", "rot_1", "rot_2", "rot_3"))
-    np.testing.assert_allclose(turns, np.diag([1, -1, -1]) @ rotations(splats.rotation), atol=1e-5)
+    turns = rotation_matrices(found("rot_0", "rot_1", "rot_2", "rot_3"))
+    np.testing.assert_allclose(turns, np.diag([1, -1, -1]) @ rotation_matrices(splats.rotation), atol=1e-5)
     assert f"comment {NOTE}".encode() in path.read_bytes()[:300]
 
 
@@ -118,7 +118,7 @@ def read_in_three():
 def test_three_reads_places_shapes_colours_and_opacities_as_they_were_written(read_in_three, kind, coarser):
     found = {name: np.array(values) for name, values in read_in_three[kind].items()}
     wanted = SPLATS if kind == "spz" else gaussian_files.turn_half(SPLATS)
-    axes = rotations(wanted.rotation) * wanted.scale[:, None, :]
+    axes = rotation_matrices(wanted.rotation) * wanted.scale[:, None, :]
     shape = np.einsum("nij,nkj->nik", axes, axes)[:, *np.triu_indices(3)]
     color = np.concatenate([0.5 + C0 * wanted.harmonics[:, 0], wanted.opacity[:, None]], axis=1)
     np.testing.assert_allclose(found["position"].reshape(-1, 3), wanted.position, atol=1e-6 + 1e-6 * coarser)

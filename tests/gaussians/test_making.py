@@ -10,7 +10,14 @@ from support.surfel_clouds import estimate
 
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.surfels import gaussians
-from spnr_jax.surfels.gaussians import C0, basis, coefficients, degree_of, half_turn_signs, rotations
+from spnr_jax.surfels.gaussians import (
+    C0,
+    count_coefficients,
+    degree_of,
+    evaluate_harmonics,
+    half_turn_signs,
+    rotation_matrices,
+)
 from spnr_jax.surfels.sides import spiral
 
 RADIUS, SIZE, MOST = 0.8, 48, 500
@@ -45,12 +52,12 @@ def surfels():
 
 @functools.cache
 def placed():
-    return gaussians.place(gaussians.collect_surface(views(), surfels()), most=MOST, pixel=PIXEL)
+    return gaussians.place_splats(gaussians.collect_surface(views(), surfels()), most=MOST, pixel=PIXEL)
 
 
 @functools.cache
 def colored():
-    return gaussians.color(placed()[0], views(), side=placed()[1], degree=1)
+    return gaussians.color_splats(placed()[0], views(), side=placed()[1], degree=1)
 
 
 def test_splats_lie_on_the_surface_and_along_it():
@@ -58,7 +65,7 @@ def test_splats_lie_on_the_surface_and_along_it():
     distance = np.linalg.norm(splats.position, axis=1)
     assert 0.6 * MOST < len(distance) <= MOST
     np.testing.assert_allclose(distance, RADIUS - gaussians.INSET * PIXEL, atol=0.03)
-    normal = rotations(splats.rotation)[:, :, 2]
+    normal = rotation_matrices(splats.rotation)[:, :, 2]
     assert (np.abs(np.sum(normal * splats.position, axis=1)) / distance).min() > 0.97
     assert side >= gaussians.FINEST * PIXEL
 
@@ -73,7 +80,7 @@ def test_the_quaternions_turn_the_third_axis_to_the_normal():
     normal = np.random.default_rng(0).normal(size=(200, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal[:2] = [0, 0, 1], [0, 0, -1]
-    axis = rotations(gaussians.turn_to(normal))[:, :, 2]
+    axis = rotation_matrices(gaussians.rotate_to(normal))[:, :, 2]
     np.testing.assert_allclose(axis, normal, atol=1e-6)
 
 
@@ -89,7 +96,7 @@ def test_colours_are_those_of_the_pictures():
 def test_splats_that_stick_out_of_the_silhouettes_are_left_out():
     splats, side = placed()
     out = splats.replace(position=splats.position * np.where(np.arange(len(splats.position)) < 20, 1.5, 1)[:, None])
-    kept = gaussians.color(out, views(), side=side, degree=0)
+    kept = gaussians.color_splats(out, views(), side=side, degree=0)
     assert np.linalg.norm(kept.position, axis=1).max() < 1.05 * RADIUS
 
 
@@ -105,9 +112,9 @@ def test_splats_look_like_the_pictures_that_they_are_made_from():
 def test_harmonics_are_orthonormal_and_turn_half_around_by_signs():
     nodes = np.random.default_rng(0).normal(size=(200_000, 3))
     nodes /= np.linalg.norm(nodes, axis=1, keepdims=True)
-    values = basis(nodes, 3)
+    values = evaluate_harmonics(nodes, 3)
     np.testing.assert_allclose(4 * np.pi * values.T @ values / len(nodes), np.eye(16), atol=0.03)
-    np.testing.assert_allclose(basis(nodes * [1, -1, -1], 3), values * half_turn_signs(3), atol=1e-12)
-    assert [degree_of(coefficients(degree)) for degree in range(4)] == [0, 1, 2, 3]
+    np.testing.assert_allclose(evaluate_harmonics(nodes * [1, -1, -1], 3), values * half_turn_signs(3), atol=1e-12)
+    assert [degree_of(count_coefficients(degree)) for degree in range(4)] == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="got 5"):
         degree_of(5)

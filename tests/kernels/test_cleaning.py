@@ -3,7 +3,7 @@ import pytest
 from support.surfel_clouds import cloud, even_square
 
 import spnr_jax
-from spnr_jax.kernels.cleaning import denoise, noise, outliers
+from spnr_jax.kernels.cleaning import denoise, find_outliers, measure_noise
 from spnr_jax.surfels.sides import spiral
 
 SIZE = np.array([1.0, 0.7, 0.5])
@@ -67,13 +67,13 @@ def test_a_clean_cloud_comes_back_itself(shape, count, spread):
 
 def test_a_density_that_varies_smoothly_loses_nothing():
     x, y = ((even_square(20000) + 1) / 2).T
-    assert not outliers(np.stack([x**3, y, 0 * x], axis=-1)).any()
+    assert not find_outliers(np.stack([x**3, y, 0 * x], axis=-1)).any()
 
 
 @pytest.mark.parametrize("count", [2000, 20000])
 @pytest.mark.parametrize("shape", ["sphere", "box"])
 def test_nine_in_ten_uniform_outliers_go_and_the_surface_stays(shape, count):
-    apart = [outliers(with_outliers(SHAPES[shape](count, "random"), seed)) for seed in range(3)]
+    apart = [find_outliers(with_outliers(SHAPES[shape](count, "random"), seed)) for seed in range(3)]
     assert np.mean([mask[-(count // 100) :] for mask in apart]) >= 0.9
     assert np.mean([mask[: -(count // 100)] for mask in apart]) < 0.001
 
@@ -91,7 +91,7 @@ def test_averaging_takes_three_fifths_of_the_noise_of_one_per_cent(shape, distan
 def test_the_noise_is_measured_in_the_units_of_the_points(share):
     points = sphere(20000, "even")
     true = share * np.sqrt(4 * np.pi / len(points))
-    sigma, _ = noise(7 * (points + np.random.default_rng(0).normal(size=points.shape) * true))
+    sigma, _ = measure_noise(7 * (points + np.random.default_rng(0).normal(size=points.shape) * true))
     np.testing.assert_allclose(sigma, 7 * true, rtol=0.2)
 
 

@@ -28,7 +28,7 @@ def same(mask: np.ndarray, other: np.ndarray) -> bool:
 def test_the_dominant_plane_is_the_table_and_takes_its_noise_along(tilt, noise):
     positions, part = table_scene(tilt)
     positions = positions + noise * np.random.default_rng(1).normal(size=positions.shape)
-    plane = scenes.dominant_plane(positions)
+    plane = scenes.find_dominant_plane(positions)
     np.testing.assert_allclose(abs(plane.normal @ [-np.sin(tilt), np.cos(tilt), 0]), 1, atol=1e-3)
     held = plane.holds(positions)
     assert held[part == 3].mean() > 0.99
@@ -39,10 +39,10 @@ def test_the_dominant_plane_is_the_table_and_takes_its_noise_along(tilt, noise):
 def test_clusters_are_numbered_by_their_size_and_do_not_depend_on_the_order_of_the_points():
     positions, part = table_scene()
     positions, part = positions[part < 3], part[part < 3]
-    labels = scenes.clusters(positions)
+    labels = scenes.find_clusters(positions)
     assert same(labels, part)
     turned = np.random.default_rng(3).permutation(len(part))
-    assert same(scenes.clusters(positions[turned]), labels[turned])
+    assert same(scenes.find_clusters(positions[turned]), labels[turned])
 
 
 def test_clusters_are_those_of_a_plain_loop_over_voxels():
@@ -56,7 +56,7 @@ def test_clusters_are_those_of_a_plain_loop_over_voxels():
             names[cell] = max(names[cell], sorted(cells).index(start))
             reached += [c for c in cells if names[c] < 0 and max(abs(np.subtract(c, cell))) < 2 and c not in reached]
     expected = [names[tuple(c)] for c in np.floor((positions - positions.min(axis=0)) / 0.2).astype(int)]
-    labels = scenes.clusters(positions, 0.2)
+    labels = scenes.find_clusters(positions, 0.2)
     pairs = set(zip(labels.tolist(), expected, strict=True))
     assert len(pairs) == len(set(labels.tolist())) == len(set(expected)) > 3
 
@@ -71,16 +71,16 @@ def test_what_stands_on_the_table_is_cut_out_ball_by_ball(nth):
 
 def object_of(positions, nth=None):
     """Rows of what is left without the dominant plane, or of one cluster of it."""
-    return scenes.object_of(positions, np.zeros(3), remove_plane=True, nth=nth, seed=0)
+    return scenes.select_object(positions, np.zeros(3), remove_plane=True, nth=nth, seed=0)
 
 
 def test_a_box_holds_what_lies_on_its_borders_and_one_without_points_is_named():
     positions = np.array([[0.0, 0, 0], [1, 1, 1], [2, 0, 0]])
-    inside = scenes.in_box(positions, (0, 0, 0, 1, 1, 1))
+    inside = scenes.is_inside(positions, (0, 0, 0, 1, 1, 1))
     assert same(inside, np.array([True, True, False]))
-    assert scenes.crop_box(2, 3, (0, 0, 0, 1, 1, 1), *positions[[0, 1]]) == "--crop: 2 of 3 points lie inside"
+    assert scenes.describe_crop(2, 3, (0, 0, 0, 1, 1, 1), *positions[[0, 1]]) == "--crop: 2 of 3 points lie inside"
     with pytest.raises(ValueError, match=r"--crop 5 5 5 6 6 6: none of the 29,000 points, they lie in the box 0"):
-        scenes.crop_box(0, 29_000, (5, 5, 5, 6, 6, 6), *positions[[0, 2]])
+        scenes.describe_crop(0, 29_000, (5, 5, 5, 6, 6, 6), *positions[[0, 2]])
 
 
 def test_a_step_that_leaves_nothing_is_named():
@@ -98,12 +98,12 @@ def test_a_step_that_leaves_nothing_is_named():
 @pytest.mark.parametrize("size", [0.0, 1e-35, 1e30])
 def test_few_points_of_any_size_have_clusters_and_perhaps_a_plane(count, size):
     positions = size * np.random.default_rng(count).normal(size=(count, 3))
-    labels = scenes.clusters(positions)
+    labels = scenes.find_clusters(positions)
     assert sorted(set(labels.tolist())) == list(range(labels.max() + 1))
-    plane = scenes.dominant_plane(positions)
+    plane = scenes.find_dominant_plane(positions)
     assert plane is None or np.isfinite(plane.normal).all()
 
 
 def test_a_point_at_the_end_of_the_world_is_a_cluster_of_its_own():
-    labels = scenes.clusters(np.concatenate([[[1e35, 0, 0]], spiral(5000)]))
+    labels = scenes.find_clusters(np.concatenate([[[1e35, 0, 0]], spiral(5000)]))
     assert same(labels, np.arange(5001) == 0)

@@ -9,7 +9,7 @@ from support import reference
 from support.laws import close, numbers, same_bits
 
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.voxels import row_of, scatter_conv, scatter_mean, spread, trilinear
+from spnr_jax.kernels.voxels import mean_contributions, row_of, scatter_conv, scatter_mean, trilinear
 
 D = 4
 POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel
@@ -96,7 +96,7 @@ class TestScatterConv:
 
     @staticmethod
     def sparse(positions, features, mask, kernel):
-        return scatter_conv(*spread(positions, features, mask, D), kernel, D)
+        return scatter_conv(*mean_contributions(positions, features, mask, D), kernel, D)
 
     def test_is_the_convolution_of_the_scattered_volume_in_value_and_gradient(self):
         weights = numbers(6, D, D, D, 4)

@@ -478,7 +478,7 @@ LOSSES = (
     Law("metrics of pictures", quality, quality_twin,
         usual(lambda rng: (*(0.5 + 0.4 * rng.uniform(-1, 1, (2, 12, 12, 3))), np.eye(12))),
         extremes=Extremes((pictures(),), floors=(FINITE,) * 3, atol=lambda *x: 2e-3)),
-    Law("bilinear", lambda x: imaging.bilinear(x, 6, 9),
+    Law("bilinear", lambda x: imaging.resize_bilinear(x, 6, 9),
         each(partial(reference.bilinear, height=6, width=9), "(h,w,c)->(a,b,c)"), usual(around_zero(2, 4, 6, 2))),
     Law("double_size", imaging.double_size, lambda x: np.stack([reference.bilinear(one, 2 * x.shape[1],
             2 * x.shape[2]) for one in x]), usual(around_zero(2, 3, 4, 2))),
@@ -541,7 +541,7 @@ def render(volume, origins, directions, bias):
     )
     module, rays = inference.network(config), Rays(origins=origins, directions=directions)
     encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
-    traced = partial(paper_method.trace, samples=config.sampling, options=AS_TRAINED, key=None)
+    traced = partial(paper_method.render_rays, samples=config.sampling, options=AS_TRAINED, key=None)
     shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
 
     def draw(x):

@@ -20,7 +20,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_MAPS
 from spnr_jax.surfels import discs, layers, lighting, splatting
-from spnr_jax.surfels.layers import NEIGHBORS, RULES
+from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS
 
 POINTS = 16
 
@@ -100,7 +100,8 @@ SYSTEMS = (
         (Axis("ridge of unknowns", 1, 10, 1e6, systems),), shared=0),
     Law("solve, one unknown", numerics.solve, lambda matrix, right: right / matrix[:1],
         usual(lambda rng: (rng.uniform(1, 2, (1, 1, POINTS)), rng.normal(size=(1, 3, POINTS))))),
-    Law("frame", numerics.frame, frame_twin, (Axis("angle from straight down", 1e-6, 1, 1.5, normals),), shared=0,
+    Law("frame", numerics.tangent_frame, frame_twin,
+        (Axis("angle from straight down", 1e-6, 1, 1.5, normals),), shared=0,
         extremes=Extremes((extremes(9, 3).map(some_normals),), floors=(FINITE,), check=are_frames, twin=False)),
     Law("cross and dot", lambda a, b: (numerics.cross(a, b), numerics.dot(a, b)),
         lambda a, b: (np.cross(a, b, axis=0), np.sum(a * b, axis=0)),
@@ -131,7 +132,7 @@ def sheets(rng, size=1.0):
 
 
 def hood_of(offset):
-    return layers.Hood(jnp.ones_like(offset[:, 0]), offset, jnp.sum(offset**2, axis=1), offset[:, :0])
+    return layers.Neighborhood(jnp.ones_like(offset[:, 0]), offset, jnp.sum(offset**2, axis=1), offset[:, :0])
 
 
 def covariance(offset, spacing):
@@ -144,12 +145,12 @@ def covariance_twin(offset, spacing):
 
 def spacings(offset):
     """From the discs that hold some of the neighbours, whatever their layer."""
-    return discs.first_spacing(hood_of(offset), RULES)
+    return discs.measure_raw_spacing(hood_of(offset), CONSTANTS)
 
 
 def spacings_twin(offset):
     distance = np.sort(np.linalg.norm(offset, axis=1), axis=0)
-    return np.sqrt(np.pi / RULES.first_disc) * distance[RULES.first_disc]
+    return np.sqrt(np.pi / CONSTANTS.raw_neighbors) * distance[CONSTANTS.raw_neighbors]
 
 
 def sorted_sheets(rng, size):
@@ -164,7 +165,9 @@ def quadric(offset, spacing):
     up = jnp.stack([jnp.zeros_like(spacing), jnp.zeros_like(spacing), jnp.ones_like(spacing)])
     weight = jnp.exp(-0.2 * jnp.sum((offset / spacing[None, None]) ** 2, axis=1))
     free = jnp.zeros(spacing.shape, bool)
-    layer, _ = layers.fit_layers(hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(RULES, rounds=1))
+    layer, _ = layers.fit_layers(
+        hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(CONSTANTS, fit_rounds=1)
+    )
     return layer.normal, layer.height
 
 
@@ -173,7 +176,7 @@ def places(rng, size):
 
 
 def farthest_twin(place):
-    return np.stack([(place[:, 0] * np.cos(t) + place[:, 1] * np.sin(t)).max(axis=0) for t in discs.TURN])
+    return np.stack([(place[:, 0] * np.cos(t) + place[:, 1] * np.sin(t)).max(axis=0) for t in discs.RIM_ANGLES])
 
 
 def borders(place, colors):
@@ -181,7 +184,7 @@ def borders(place, colors):
     place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return tuple(discs.find_border(place, jnp.ones_like(place[:, 0]), one, axes, colors, RULES).values())
+    return tuple(discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors, CONSTANTS).values())
 
 
 def parted(rng, size):
@@ -212,7 +215,7 @@ def lists(rng, tau=1.0, distance=2.0):
 
 
 def shares_twin(tau, depth, spacing):
-    return reference.shares(tau, depth, spacing, splatting.NEAR)
+    return reference.shares(tau, depth, spacing, splatting.COMPARED)
 
 
 @st.composite
@@ -240,9 +243,9 @@ def within_one(arguments, outputs):
 # fmt: off
 LISTS = (
     # thin lists are a series, to 7e-9: no twin
-    Law("shares", splatting.shares, None, (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0,
-        floors=(0.0, 1.0)),
-    Law("shares beside the loop", splatting.shares, shares_twin,
+    Law("blend weights", splatting.compute_blend_weights, None,
+        (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 1.0)),
+    Law("blend weights beside the loop", splatting.compute_blend_weights, shares_twin,
         (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 1.0),
         extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,
         atol=lambda tau, *x: 1e-6 * (1 + gap_rounding(tau, *x) * tau.max()), check=within_one)),
@@ -269,14 +272,16 @@ def mirrors(light, directions, roughness):
 
 
 def arrives(light, visible, normal):
-    """Irradiance, as `lighting.arriving` has it of surfels."""
+    """Irradiance, as `lighting.gather_irradiance` has it of surfels."""
     count = visible.shape[-1]
     found = surfels(np.zeros((count, 3)), (0.0, 0.0, 1.0), 0.1)
-    return lighting.arriving(dataclasses.replace(found, visible=visible.T, normal=normal.T), Light(tables=light)).T
+    return lighting.gather_irradiance(
+        dataclasses.replace(found, visibility=visible.T, normal=normal.T), Light(tables=light)
+    ).T
 
 
 def shade(outputs, maps, ambient):
-    return shader.picture(outputs, maps, ambient, 0)
+    return shader.compose_picture(outputs, maps, ambient, 0)
 
 
 def lit(rng, light):

@@ -1,4 +1,4 @@
-"""Laws of the densifier: where children may lie, batching, order, padding, turning, gradients, few and equal points."""
+"""Laws of the densifier: where learned points lie, batching, order, padding, rotation, gradients, degenerate clouds."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from support.surfel_clouds import cloud, shape
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.method import densifier, surfel_method
-from spnr_jax.method.densifier import CHILDREN, Nodes, place
+from spnr_jax.method.densifier import CANDIDATES, Nodes, place_candidates
 from spnr_jax.training import weights
 
 COUNT, SIZE = 150, 512  # real points, and with padding; whole clouds have as many, so that they share programs
@@ -38,33 +38,33 @@ def ball(seed=0):
 
 def kept(dense):
     """What is kept of a dense cloud, sorted by place, so that orders can be compared."""
-    columns = [dense.positions, dense.normals, dense.base_color, dense.invented[:, None]]
+    columns = [dense.positions, dense.normals, dense.base_color, dense.learned[:, None]]
     rows = np.concatenate([np.asarray(x) for x in columns], axis=1)[np.asarray(dense.mask)]
     return rows[np.lexsort(np.round(rows[:, :3], 3).T)]
 
 
-def test_measured_points_are_kept_as_they_are_and_children_are_told(params):
+def test_measured_points_are_kept_as_they_are_and_learned_points_are_told(params):
     points = ball()
     dense = run(params, points, spnr_jax.neighbors(points))
-    assert dense.mask.shape == (SIZE * (1 + CHILDREN),)
+    assert dense.mask.shape == (SIZE * (1 + CANDIDATES),)
     for name in ("positions", "base_color", "roughness", "metallic", "mask"):
         np.testing.assert_array_equal(getattr(dense, name)[:SIZE], getattr(points, name))
-    invented = np.asarray(dense.invented)[np.asarray(dense.mask)]
-    np.testing.assert_array_equal(invented[:COUNT], 0)
-    assert (invented[COUNT:] >= 0.5).all()
-    assert (invented <= 1).all()
-    assert COUNT < len(invented) - COUNT < 4 * COUNT
+    learned = np.asarray(dense.learned)[np.asarray(dense.mask)]
+    np.testing.assert_array_equal(learned[:COUNT], 0)
+    assert (learned[COUNT:] >= 0.5).all()
+    assert (learned <= 1).all()
+    assert COUNT < len(learned) - COUNT < 4 * COUNT
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
 
 
-def test_children_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
+def test_learned_points_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):
     points, spacing = cloud(shape("sphere", SIZE)[0]), np.sqrt(4 * np.pi / SIZE)
     dense = run(params, points, spnr_jax.neighbors(points))
-    children = np.asarray(dense.positions)[SIZE:][np.asarray(dense.mask)[SIZE:]]
-    off = np.abs(np.linalg.norm(children, axis=1) - 0.6)
-    assert len(children) > 2 * SIZE
+    learned = np.asarray(dense.positions)[SIZE:][np.asarray(dense.mask)[SIZE:]]
+    off = np.abs(np.linalg.norm(learned, axis=1) - 0.6)
+    assert len(learned) > 2 * SIZE
     assert np.sqrt(np.mean(off**2)) < 0.6 * (1 - np.cos(spacing / 2)) / 2
-    assert cKDTree(children).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * spacing
+    assert cKDTree(learned).query(shape("sphere", 20_000)[0])[0].max() < 1.1 * 0.6 * spacing
 
 
 def nodes_of(positions, normals, spacing):
@@ -74,7 +74,7 @@ def nodes_of(positions, normals, spacing):
 
 def test_places_of_pairs_lie_on_circles_that_their_ends_do():
     normals = shape("sphere", 1000)[1]
-    found = jax.jit(place)(nodes_of(0.6 * normals, normals, 0.067), spnr_jax.neighbors(cloud(0.6 * normals)))
+    found = jax.jit(place_candidates)(nodes_of(0.6 * normals, normals, 0.067), spnr_jax.neighbors(cloud(0.6 * normals)))
     pairs = np.asarray(found.exists & (found.first != found.second))
     assert pairs.sum() > 2500
     close(np.linalg.norm(np.asarray(found.middle)[pairs], axis=1), 0.6, atol=1e-4)  # a cubic, to fourth order
@@ -85,17 +85,19 @@ def test_places_of_pairs_lie_on_circles_that_their_ends_do():
     close(np.linalg.det(frames), 1, atol=1e-5)
 
 
-def test_no_two_children_are_nearer_than_the_closest(params):
+def test_no_two_learned_points_are_nearer_than_the_closest(params):
     points = cloud(shape("sphere", SIZE, "random")[0])
     near = spnr_jax.neighbors(points)
     dense = jax.tree.map(lambda x: np.asarray(x)[SIZE:], run(params, points, near))
     distance = np.linalg.norm(points.positions[near] - points.positions[:, None], axis=2)
-    scale = 0.8 * np.sqrt(np.pi / 6) * np.repeat(distance[near[:, :9], 6].mean(axis=1), CHILDREN)[dense.mask]
+    scale = 0.8 * np.sqrt(np.pi / 6) * np.repeat(distance[near[:, :9], 6].mean(axis=1), CANDIDATES)[dense.mask]
     positions, normals = dense.positions[dense.mask], dense.normals[dense.mask]
     distance, other = cKDTree(positions).query(positions, 2)
     facing = np.sum(normals * normals[other[:, 1]], axis=1)
-    measure = (distance[:, 1] / (densifier.CLOSEST * np.minimum(scale, scale[other[:, 1]]))) ** 2
-    assert (measure + densifier.AWAY * (1 - facing) >= 0.999).mean() > 0.95  # rivals are looked for at 12 neighbors
+    measure = (distance[:, 1] / (densifier.LEAST_DISTANCE * np.minimum(scale, scale[other[:, 1]]))) ** 2
+    assert (
+        measure + densifier.NORMAL_PENALTY * (1 - facing) >= 0.999
+    ).mean() > 0.95  # rivals are looked for at 12 neighbors
 
 
 def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
@@ -113,20 +115,20 @@ def test_blocks_are_the_whole_at_once(params, monkeypatch):
     near = jnp.asarray(spnr_jax.neighbors(points))
     nodes, places = jax.jit(densifier.build_graph)(points, near)
     found = []
-    for block in (SIZE * CHILDREN, 37):
+    for block in (SIZE * CANDIDATES, 37):
         monkeypatch.setattr(densifier, "BLOCK", block)
         found.append(jax.jit(lambda *x: densifier.predict(*x))(params["densifier"], nodes, near, places))
     jax.tree.map(lambda *x: close(*(y[np.asarray(places.exists)] for y in x), atol=1e-5), *found)
 
 
-def test_a_dense_cloud_gets_children_where_it_ends_or_bends_alone(monkeypatch):
+def test_a_dense_cloud_gets_learned_points_where_it_ends_or_bends_alone(monkeypatch):
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(31)), axis=-1).reshape(-1, 2)
     edge = np.concatenate([np.insert(grid[:400], 2, 0, axis=1), np.insert(grid[20:], 0, 0, axis=1)])
     near = spnr_jax.neighbors(cloud(edge * 0.05))
     nodes = nodes_of(edge * 0.05, np.repeat(np.eye(3)[[2, 0]], [400, 600], axis=0), 0.05)
-    everywhere = jax.jit(place)(nodes, near)
+    everywhere = jax.jit(place_candidates)(nodes, near)
     monkeypatch.setattr(densifier, "SPARSE", len(edge) - 1)
-    some = jax.jit(lambda *x: place(*x))(nodes, near)
+    some = jax.jit(lambda *x: place_candidates(*x))(nodes, near)
     pairs = [np.asarray(x.exists & (x.first != x.second)) for x in (everywhere, some)]
     middle = [np.asarray(x.middle)[y] for x, y in zip((everywhere, some), pairs, strict=True)]
     flat = [np.sum((x > 0.1).sum(axis=1) == 2) for x in middle]  # well inside one of the two squares
@@ -149,7 +151,7 @@ def test_padding_and_the_order_of_points_do_not_matter(params):
     assert (distance < 1e-3).mean() > 0.97  # which end owns a pair follows the numbers, and some points own too many
 
 
-def test_a_turned_cloud_has_turned_children(params):
+def test_a_turned_cloud_has_turned_learned_points(params):
     normals = shape("sphere", SIZE, "random")[1]
     turn = np.float32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
     points = cloud(0.6 * normals)
@@ -181,7 +183,7 @@ def test_few_points_and_equal_ones_stay_finite(params, positions):
     dense = run(params, points, spnr_jax.neighbors(points))
     for values in jax.tree.leaves(dense):
         assert np.isfinite(values).all()
-    assert int(dense.mask.sum()) <= len(positions) * (1 + CHILDREN)
+    assert int(dense.mask.sum()) <= len(positions) * (1 + CANDIDATES)
     np.testing.assert_array_equal(dense.mask[: len(positions)], True)
 
 
@@ -200,4 +202,4 @@ def test_the_handle_densifies_sparse_clouds_alone(params, monkeypatch):
 def test_the_handle_encodes_the_points_alone_where_it_is_asked_to():
     surfels = spnr_jax.load().encode(cloud(shape("sphere", 300)[0]), densify=False).scene.surfels
     assert int(np.sum(surfels.mask)) == 300
-    np.testing.assert_array_equal(surfels.invented, 0)
+    np.testing.assert_array_equal(surfels.learned, 0)

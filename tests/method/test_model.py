@@ -118,7 +118,7 @@ class TestQuality:
     def test_a_quality_is_a_share_of_the_samples_near_the_points_or_what_the_training_took(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = samples and RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=3))
-        assert paper_method.at_quality(config, quality, 3) == expected
+        assert paper_method.choose_options(config, quality, 3) == expected
 
     def test_another_word_is_refused(self, handle):
         volume = handle.encode(example_cloud())
@@ -135,5 +135,5 @@ class TestQuality:
 
     def test_reach_follows_the_distance_between_the_points(self):
         grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart
-        assert [paper_method.reach_of(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
-        assert paper_method.reach_of(grid[:1], 32) == LARGEST_REACH
+        assert [paper_method.estimate_reach(grid, resolution) for resolution in (4, 8, 16, 64)] == [1, 2, 4, 4]
+        assert paper_method.estimate_reach(grid[:1], 32) == LARGEST_REACH

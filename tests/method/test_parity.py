@@ -13,7 +13,7 @@ from experiments.speed.bench import make_batch
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference
-from spnr_jax.method.paper_method import trace
+from spnr_jax.method.paper_method import render_rays
 from spnr_jax.nn.paper_layers import encode_direction
 from spnr_jax.training import optimisation
 
@@ -53,9 +53,9 @@ def stages():
         objects = jnp.zeros(rays.origins.shape[:-1], jnp.int32)
         coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
-        density, (rgb, _) = module.along(scene, rays, objects)[0](coarse)
+        density, (rgb, _) = module.make_field(scene, rays, objects)[0](coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
-        features, depth, acc = trace(module, scene, rays, counts, AS_TRAINED, None)
+        features, depth, acc = render_rays(module, scene, rays, counts, AS_TRAINED, None)
         cell, offset = voxels.locate(cloud.positions, resolution)
         grid, occupancy = voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution)
         rendering = module.render(scene, camera)

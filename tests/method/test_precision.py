@@ -14,7 +14,7 @@ from support.tiny_training import BATCH, CONFIG
 from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
-from spnr_jax.method.paper_method import trace
+from spnr_jax.method.paper_method import render_rays
 from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains several networks
@@ -60,7 +60,7 @@ def test_points_field_sampling_and_compositing_stay_float32():
 
     def samples(variables, key):
         module = inference.network(BF16_MODEL).bind(variables)
-        return trace(module, scene, rays, BF16_MODEL.sampling, AS_TRAINED, key)
+        return render_rays(module, scene, rays, BF16_MODEL.sampling, AS_TRAINED, key)
 
     def points(variables):
         module = inference.network(BF16_MODEL).bind(variables)

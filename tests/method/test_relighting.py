@@ -10,7 +10,7 @@ from support.surfel_clouds import cloud, shape
 import spnr_jax
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.surfels.lighting import directions
+from spnr_jax.surfels.lighting import texel_directions
 
 COUNT = 1400  # points of every body: few programs
 SIZE = 132  # more than those of pictures that are drawn at twice the size: means of sRGB are not linear in the light
@@ -65,7 +65,7 @@ def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(mo
 
     def drawn(volume, light, azimuth):
         if not shadowed:
-            surfels = volume.scene.surfels.replace(visible=jnp.ones_like(volume.scene.surfels.visible))
+            surfels = volume.scene.surfels.replace(visibility=jnp.ones_like(volume.scene.surfels.visibility))
             volume = volume.replace(scene=volume.scene.replace(surfels=surfels))
         return linear(model, volume, light, azimuth)
 
@@ -92,7 +92,7 @@ def test_uniform_light_shows_the_albedo_of_a_matt_convex_body(model, quality, wi
 def test_light_comes_from_where_it_stands(model):
     """A ball lit from the right is brighter there, and so is its picture from behind, on the other side."""
     volume = model.encode(cloud(shape("sphere", COUNT)[0], roughness=np.ones(COUNT)), densify=False)
-    right = spnr_jax.light_of(np.maximum(directions(32) @ [1, 0, 0], 0)[..., None] ** 4 * np.ones(3, np.float32))
+    right = spnr_jax.light_of(np.maximum(texel_directions(32) @ [1, 0, 0], 0)[..., None] ** 4 * np.ones(3, np.float32))
     for azimuth, side in ((30.0, 1), (210.0, -1)):
         image, solid = linear(model, volume, right, azimuth)
         columns = np.arange(SIZE)[None] - SIZE / 2

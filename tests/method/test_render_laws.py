@@ -109,7 +109,7 @@ def test_compiled_it_is_what_its_operations_give_one_by_one(params, views, light
 
 
 def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(scenes, views, lights):
-    blend = jax.jit(surfel_renderer.blend_window, static_argnames="plan")
+    blend = jax.jit(surfel_renderer.rasterize_window, static_argnames="plan")
     given = scenes[0], views[0], lights[0]
     sizes = jax.device_get(surfel_renderer.count_sizes(*given[:2], doublings=ROOM.doublings, side=ROOM.side))
     exact = ROOM._replace(entries=int(sizes.entries), slots=int(sizes.slots))

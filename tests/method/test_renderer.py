@@ -126,7 +126,7 @@ class TestViews:
         def densities(rays, distances):
             module = inference.network(CONFIG).bind(variables)
             everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
-            field, _ = module.along(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32))
+            field, _ = module.make_field(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32))
             return field(distances).density
 
         found = np.asarray(densities(rays, jnp.asarray((near + far) / 2)[..., None]))[..., 0][hit]

@@ -15,7 +15,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_method import encode_in_box
-from spnr_jax.method.surfel_renderer import GRID, resolution
+from spnr_jax.method.surfel_renderer import GRID, choose_resolution
 from spnr_jax.nn.shader import NUM_FEATURES, Shader
 from spnr_jax.surfels.lighting import light_of
 
@@ -104,7 +104,7 @@ def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_de
 def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     size = 96
     view = camera(size, eye=(1.2, 0.8, 4.2))
-    doublings, side = resolution(scene, view)
+    doublings, side = choose_resolution(scene, view)
     assert side == 1
     step = GRID * 2**doublings
     moved = dataclasses.replace(view, intrinsics=view.intrinsics.at[0, 2].add(step).at[1, 2].add(-step))
@@ -120,7 +120,7 @@ def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_sa
         large = camera(size, (0.6, 0.4, 2.6))
         small = cameras.resize(large, round(share * size), round(share * size))
         other = scene.replace(spacing=spacing)
-        assert resolution(other, small, share) == resolution(other, large)
+        assert choose_resolution(other, small, share) == choose_resolution(other, large)
     whole, found = (render(fresh, scene, view, quality) for quality in ("best", "balanced"))
     assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, whole)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(whole), strict=True):

@@ -7,7 +7,7 @@ import pytest
 from support.laws import close, numbers
 
 from spnr_jax.kernels.compositing import composite, volume_weights
-from spnr_jax.kernels.imaging import bilinear, srgb_to_linear
+from spnr_jax.kernels.imaging import resize_bilinear, srgb_to_linear
 from spnr_jax.kernels.numerics import normalize
 from spnr_jax.nn.paper_layers import (
     BRIGHTNESS_AND_HUE,
@@ -15,20 +15,20 @@ from spnr_jax.nn.paper_layers import (
     RadianceField,
     UNet3D,
     Upsampler,
-    spread_out,
+    whiten_materials,
 )
 
 
 class TestMaterials:
     def test_spread_materials_part_brightness_from_hue_and_lose_nothing(self):
         grey = jnp.tile(jnp.linspace(0, 1, 5)[:, None], (1, 3))
-        close(spread_out(grey)[:, 1:], np.zeros((5, 2)), atol=1e-5)
-        close(spread_out(grey)[jnp.array([0, -1]), 0], np.array([-2.0, 2.0]), atol=1e-5)
+        close(whiten_materials(grey)[:, 1:], np.zeros((5, 2)), atol=1e-5)
+        close(whiten_materials(grey)[jnp.array([0, -1]), 0], np.array([-2.0, 2.0]), atol=1e-5)
         colors = jax.random.uniform(jax.random.key(3), (40, 3))
-        encoded = np.linalg.solve(np.float64(BRIGHTNESS_AND_HUE).T, np.float64(spread_out(colors)).T).T + 0.5
+        encoded = np.linalg.solve(np.float64(BRIGHTNESS_AND_HUE).T, np.float64(whiten_materials(colors)).T).T + 0.5
         close(srgb_to_linear(jnp.asarray(encoded, jnp.float32)), colors, atol=1e-5)
-        close(spread_out(jnp.array([[0.0], [0.5], [1.0]])), np.array([[-1.0], [0.0], [1.0]]))
-        assert jnp.isfinite(jax.grad(lambda x: spread_out(x).sum())(jnp.zeros((1, 3)))).all()
+        close(whiten_materials(jnp.array([[0.0], [0.5], [1.0]])), np.array([[-1.0], [0.0], [1.0]]))
+        assert jnp.isfinite(jax.grad(lambda x: whiten_materials(x).sum())(jnp.zeros((1, 3)))).all()
 
 
 ROWS, VALUES = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32), numbers(1, 2, 20, 3)
@@ -77,7 +77,7 @@ def everything(module, x, directions):
     density, (rgb, hidden) = module(x, view)
     weights, _ = volume_weights(density, jnp.full(density.shape, 0.3))
     emitted = composite(weights, rgb), composite(weights, hidden)
-    return density, rgb, hidden, weights, view, module.finish(emitted, jnp.sum(weights, axis=-1), view)
+    return density, rgb, hidden, weights, view, module.decode(emitted, jnp.sum(weights, axis=-1), view)
 
 
 FIELD_VARIABLES = jax.jit(lambda key: FIELD.init(key, X, DIRECTIONS, method=everything))(jax.random.key(0))
@@ -128,7 +128,7 @@ def test_the_field_is_finite_in_value_and_gradient_however_large_the_volume_is(s
 def test_a_fresh_upsampler_gives_the_bilinear_picture():
     x = numbers(0, 2, 4, 6, 5)
     found = jax.jit(lambda key: Upsampler(width=4).init_with_output(key, x)[0])(jax.random.key(0))
-    close(found, bilinear(x[..., :3], 8, 12), rtol=0, atol=0)
+    close(found, resize_bilinear(x[..., :3], 8, 12), rtol=0, atol=0)
 
 
 def test_condition_and_mask_change_the_discriminators_mind_and_other_images_do_not():

@@ -7,10 +7,10 @@ from support.laws import close, numbers
 
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import COLOR_STEP, LEAST_ODDS, NOTHING, NUM_MAPS, NUM_OUTPUTS, ODDS_STEP
+from spnr_jax.nn.shader import COLOR_STEP, LOGIT_MARGIN, LOGIT_STEP, NOTHING, NUM_MAPS, NUM_OUTPUTS
 from spnr_jax.surfels.lighting import SPECULAR
 
-picture = jax.jit(shader.picture, static_argnums=3)
+picture = jax.jit(shader.compose_picture, static_argnums=3)
 LIT = slice(7, 16)  # maps that are linear in the light
 
 
@@ -34,7 +34,7 @@ class TestPicture:
         arriving, _, mirrored, reflected = np.split(np.float64(values[..., 7:]), [3, 6, 9], axis=-1)
         specular = ((SPECULAR * (1 - metallic) + color * metallic) * factor + summand) * mirrored * reflected
         close(linear, color * (1 - metallic) * arriving + specular, rtol=1e-4)
-        close(alpha, ((opacity + LEAST_ODDS) / (1 + 2 * LEAST_ODDS))[..., 0], rtol=1e-4)
+        close(alpha, ((opacity + LOGIT_MARGIN) / (1 + 2 * LOGIT_MARGIN))[..., 0], rtol=1e-4)
 
     def test_each_output_does_what_its_name_says(self):
         values, ambient = maps(), numbers(6, 1, 9, 3, low=0.1, high=0.3)
@@ -49,7 +49,7 @@ class TestPicture:
         close(change(0)[0][..., 0], COLOR_STEP * values[..., 7], rtol=1e-3)
         close(change(0)[0][..., 1:], np.zeros((1, 6, 6, 2)))
         _, alpha, before = change(3)
-        close(np.log(alpha / (1 - alpha)), np.log(before / (1 - before)) + ODDS_STEP, rtol=1e-3, atol=1e-3)
+        close(np.log(alpha / (1 - alpha)), np.log(before / (1 - before)) + LOGIT_STEP, rtol=1e-3, atol=1e-3)
         close(change(4, 0.1)[0], 0.05 * values[..., 7:10], rtol=1e-3, atol=1e-6)
         close(change(5, 0.1)[0], 0.05 * values[..., 10:13], rtol=1e-3, atol=1e-6)
         specular = (SPECULAR * values[..., 5:6] + values[..., 6:7]) * values[..., 13:16]

@@ -39,7 +39,7 @@ def gradients_apart(model) -> float:
         return jax.tree.map(lambda x: x.astype("float64") if x.dtype == np.float32 else x, tree)
 
     for mesh in (None, programs.device_mesh()):
-        with programs.using(mesh):
+        with programs.use_mesh(mesh):
             state = precise(optimisation.jitted_create_state(config))
             placed = programs.place_batch(precise(batch), mesh)
             state, _ = optimisation.jitted_train_step(state, placed, config=config, adversarial=False)

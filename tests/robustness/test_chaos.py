@@ -89,12 +89,12 @@ def test_a_training_that_was_killed_ends_with_the_same_bits_and_rows(whole):
 
 
 def test_a_second_training_in_one_folder_is_refused_until_the_first_is_over(tmp_path, capsys):
-    with checkpoint.alone(tmp_path):
+    with checkpoint.lock_run(tmp_path):
         code = cli.guard(lambda: trainer.train(CONFIG, tiny_dataset.dataset(), tmp_path, tiny_dataset.SCHEDULE), "spnr")
     assert code == 2
     assert capsys.readouterr().err.startswith(f"spnr: {tmp_path}: another process trains in this folder")
     assert not (tmp_path / "config.json").exists()
-    with checkpoint.alone(tmp_path):
+    with checkpoint.lock_run(tmp_path):
         pass
 
 

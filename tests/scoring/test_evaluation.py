@@ -26,8 +26,8 @@ FACTORS = {"splat": 1.5, "nearest": 0.75}
 
 def methods():
     variables = optimisation.averaged_variables(checkpoint.restore(tiny_untrained.run(), CONFIG))
-    trivial = {name: evaluation.floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
-    return {"paper": evaluation.network(variables, CONFIG), **trivial}
+    trivial = {name: evaluation.make_floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
+    return {"paper": evaluation.make_method(variables, CONFIG), **trivial}
 
 
 @pytest.fixture(scope="module")
@@ -119,22 +119,22 @@ def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
 
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
-    asked = {"white": evaluation.floor("white")}
+    asked = {"white": evaluation.make_floor("white")}
     result = evaluation.evaluate_object(asked, CONFIG, data_sets.read_object(tiny_dataset.dataset(), NAMES[0]))
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
 
 def test_objects_are_spread_from_the_first_to_the_last():
-    assert evaluation.spread(tuple("abcdefg"), 3) == ("a", "d", "g")
-    assert evaluation.spread(tuple("ab"), 5) == ("a", "b")
-    assert evaluation.spread(("a",), 0) == ()
+    assert evaluation.pick_evenly(tuple("abcdefg"), 3) == ("a", "d", "g")
+    assert evaluation.pick_evenly(tuple("ab"), 5) == ("a", "b")
+    assert evaluation.pick_evenly(("a",), 0) == ()
 
 
 # the trivial renderers
 
 
 RADIUS = 0.12
-splat, nearest = jax.jit(evaluation.splat), jax.jit(evaluation.nearest)
+splat, nearest = jax.jit(evaluation.render_splat), jax.jit(evaluation.render_nearest)
 
 
 def make_cloud(positions, mask=None, **columns) -> PointCloud:
@@ -240,7 +240,7 @@ def test_of_no_points_and_of_what_lies_behind_the_eye_nothing_is_seen(renderer):
     behind = make_cloud([[0, 0, 6.0], [0.1, 0, 5.0]])
     for cloud, radius in ((make_cloud(np.zeros((2, 3)), mask=np.zeros(2, bool)), 1.0), (behind, 0.3)):
         image, acc = renderer(cloud, camera, radius)
-        np.testing.assert_array_equal(image, evaluation.white(camera))
+        np.testing.assert_array_equal(image, evaluation.render_white(camera))
         np.testing.assert_array_equal(acc, 0)
 
 
@@ -248,13 +248,13 @@ def test_blocks_of_rays_give_the_image_of_all_rays_at_once(monkeypatch):
     cloud, camera = random_cloud(7), skewed_camera()
     whole = splat(cloud, camera, RADIUS)[0]
     monkeypatch.setattr("spnr_jax.scoring.evaluation.BLOCK", 60 * 5)  # 414 rays: 82 blocks of 5 and a remainder
-    np.testing.assert_allclose(evaluation.splat(cloud, camera, RADIUS)[0], whole, atol=1e-6)
+    np.testing.assert_allclose(evaluation.render_splat(cloud, camera, RADIUS)[0], whole, atol=1e-6)
 
 
 def test_spacing_is_the_median_distance_to_the_nearest_other_real_point():
     cloud = random_cloud(8)
     real = np.asarray(cloud.positions, np.float64)[cloud.mask]
     distances = [min(np.linalg.norm(p - q) for j, q in enumerate(real) if j != i) for i, p in enumerate(real)]
-    np.testing.assert_allclose(evaluation.spacing(cloud), np.median(distances), rtol=1e-5)
+    np.testing.assert_allclose(evaluation.measure_nearest_distance(cloud), np.median(distances), rtol=1e-5)
     for real in (0, 1):
-        assert evaluation.spacing(make_cloud(np.zeros((4, 3)), mask=np.arange(4) < real)) == 0
+        assert evaluation.measure_nearest_distance(make_cloud(np.zeros((4, 3)), mask=np.arange(4) < real)) == 0

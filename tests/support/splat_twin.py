@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spnr_jax.surfels.gaussians import basis, degree_of
+from spnr_jax.surfels.gaussians import degree_of, evaluate_harmonics
 
 DILATION = 0.1  # square pixels, as the page of `spnr share` has it
 
@@ -37,7 +37,9 @@ def color(splats, number, eye):
     """sRGB of one splat as seen from a place."""
     towards = np.asarray(splats.position[number], np.float64) - eye
     harmonics = np.asarray(splats.harmonics[number], np.float64)
-    return np.maximum(0.5 + basis(towards / np.linalg.norm(towards), degree_of(len(harmonics))) @ harmonics, 0)
+    return np.maximum(
+        0.5 + evaluate_harmonics(towards / np.linalg.norm(towards), degree_of(len(harmonics))) @ harmonics, 0
+    )
 
 
 def _covariance(quaternion, scale):

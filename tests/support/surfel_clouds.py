@@ -8,7 +8,7 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, neighbors
-from spnr_jax.surfels.layers import RULES
+from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral, tangents
 
 PADDED = (4096, 32768)  # sizes that clouds are padded to: each is compiled once, and blocks of padding cost nothing
@@ -76,17 +76,17 @@ def surfels(position, normal, spacing, **columns) -> Surfels:
     normal = np.broadcast_to(normal, (count, 3))
     columns = {
         "base_color": np.full((count, 3), 0.5),
-        "border": np.zeros((count, 4)),
-        "jump": np.zeros((count, 3)),
+        "color_edge": np.zeros((count, 4)),
+        "color_jump": np.zeros((count, 3)),
         "roughness": np.full(count, 0.5),
         "metallic": np.zeros(count),
-        "guessed": np.zeros(count),
-        "invented": np.zeros(count),
-        "sided": np.ones(count),
-        "visible": np.ones((count, NUM_DIRECTIONS)),
-        "shape": np.zeros((count, 2)),
-        "rim": tangents(np.asarray(normal))[0],
-        "reach": np.full((count, 4), RULES.far),
+        "materials_unknown": np.zeros(count),
+        "learned": np.zeros(count),
+        "one_sided": np.ones(count),
+        "visibility": np.ones((count, NUM_DIRECTIONS)),
+        "shape_ratios": np.zeros((count, 2)),
+        "rim_tangent": tangents(np.asarray(normal))[0],
+        "rim_distances": np.full((count, 4), CONSTANTS.largest_radius),
     } | columns
     columns |= {"position": position, "normal": normal}
     columns |= {"spacing": np.broadcast_to(spacing, count)}

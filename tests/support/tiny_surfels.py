@@ -45,7 +45,7 @@ def dataset() -> data_sets.Dataset:
 @functools.cache
 def views() -> list[gbuffers.View]:
     """The views of the ball's clouds, in a folder that a test copies to change it."""
-    return gbuffers.complete(dataset(), LIGHT, CONFIG, tiny_dataset.folder() / "gbuffers", {})
+    return gbuffers.make_missing(dataset(), LIGHT, CONFIG, tiny_dataset.folder() / "gbuffers", {})
 
 
 @functools.cache
@@ -67,6 +67,6 @@ def untrained() -> Path:
     return folder
 
 
-def shipped(name: str = weights.SHIPPED) -> Path:
+def shipped(name: str = weights.PACKAGED) -> Path:
     """The package's files of weights, but for its network: that is `run`."""
-    return run() if name == weights.SHIPPED else PACKAGED(name)
+    return run() if name == weights.PACKAGED else PACKAGED(name)

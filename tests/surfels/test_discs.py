@@ -9,7 +9,7 @@ from support.surfel_clouds import estimate, even_square, shape
 
 from spnr_jax.surfels import discs
 from spnr_jax.surfels.geometry import nearest
-from spnr_jax.surfels.layers import RULES
+from spnr_jax.surfels.layers import CONSTANTS
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1
 RED, BLUE = np.array([0.7, 0.1, 0.1]), np.array([0.1, 0.2, 0.6])
@@ -27,7 +27,7 @@ def test_the_line_between_two_colours_is_found_beside_it_and_nowhere_else(spread
     positions, axes, beyond, spacing = parted(spread)
     found = estimate(positions, np.where(beyond[:, None] > 0, BLUE, RED))
     inner = np.abs(positions @ axes.T).max(axis=1) < 0.5 * np.abs(positions @ axes.T).max()
-    border, jump = found.border, found.jump
+    border, jump = found.color_edge, found.color_jump
     has = np.abs(jump).max(axis=1) > 0.9 * np.abs(RED - BLUE).max()
     assert np.mean(has[inner & (np.abs(beyond) < 0.7 * spacing)]) > most
     assert not jump[inner & (np.abs(beyond) > 4 * spacing)].any()
@@ -37,7 +37,7 @@ def test_the_line_between_two_colours_is_found_beside_it_and_nowhere_else(spread
     assert np.median(np.abs(border[near, 3] - np.abs(beyond[near]))) < 0.2 * spacing
     np.testing.assert_allclose(jump[near], np.where(beyond[near, None] > 0, RED - BLUE, BLUE - RED), atol=0.06)
     alone = estimate(positions, np.tile(RED, (len(positions), 1)))
-    assert not alone.jump.any()
+    assert not alone.color_jump.any()
 
 
 def test_one_colour_a_gradient_and_speckles_have_no_borders():
@@ -46,7 +46,7 @@ def test_one_colour_a_gradient_and_speckles_have_no_borders():
     speckled = np.where(np.random.default_rng(0).uniform(size=(len(positions), 1)) < 0.4, BLUE, RED)
     steep = 0.6 + 0.3 * np.sin(10 * beyond)[:, None] * [1.0, -1, 1]
     for color, most in ((np.tile(RED, (len(positions), 1)), 0), (smooth, 0), (steep, 0), (speckled, 0.03)):
-        jump = estimate(positions, color).jump
+        jump = estimate(positions, color).color_jump
         assert np.mean(np.abs(jump).max(axis=1) > 0.1) <= most
 
 
@@ -58,7 +58,7 @@ def widened(points):
     spacing = np.full(len(points), 1 / np.sqrt(len(points)), np.float32)
     near = nearest(np.pad(points, ((0, 0), (0, 1)))).T
     place = np.float32(((points[near] - points[None]) / spacing[0]).transpose(0, 2, 1))
-    return np.asarray(bridge(jnp.asarray(place), jnp.ones(near.shape), RULES)), spacing
+    return np.asarray(bridge(jnp.asarray(place), jnp.ones(near.shape), CONSTANTS)), spacing
 
 
 def gaps(points, spacing):
@@ -79,7 +79,7 @@ def test_discs_beside_a_gap_are_as_wide_as_the_voronoi_diagram_has_it():
     inner = (np.abs(points - 0.5) < 0.4).all(axis=1)
     radius = gaps(points, spacing)
     inner &= radius < 1.6  # of wider ones the far side is not among the neighbours
-    expected = np.maximum(radius / RULES.bridged, 1)
+    expected = np.maximum(radius / CONSTANTS.gap_cover, 1)
     ratio = (found / expected)[inner]
     # 16 directions miss a vertex by 11 degrees at most; some gaps are wider than the 20 neighbours reach
     low, high = np.quantile(ratio, [0.02, 0.97])
@@ -90,7 +90,7 @@ def test_discs_beside_a_gap_are_as_wide_as_the_voronoi_diagram_has_it():
 
 def test_where_the_surface_ends_nothing_grows_without_limit():
     found, _ = widened(np.random.default_rng(1).random((3000, 2)))
-    assert found.max() <= RULES.widest_gap / RULES.bridged + 1e-6
+    assert found.max() <= CONSTANTS.widest_gap / CONSTANTS.gap_cover + 1e-6
 
 
 @pytest.mark.parametrize("count", [400, 4096])

@@ -8,11 +8,11 @@ from support.surfel_clouds import estimate as surfels_of
 from support.surfel_clouds import even_square, shape
 
 from spnr_jax.kernels.cloud_arrays import farthest_points
-from spnr_jax.surfels.layers import RULES
+from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.sides import tangents
 from spnr_jax.surfels.splatting import RADIUS
 
-FIELDS = ("normal", "spacing", "jump", "sided", "visible", "shape")
+FIELDS = ("normal", "spacing", "color_jump", "one_sided", "visibility", "shape_ratios")
 
 
 def estimate(positions, color=None, normals=None):
@@ -36,10 +36,10 @@ def test_normals_point_outward_within_degrees_and_the_spacing_is_the_root_of_the
     found = estimate(positions)
     cosine = np.sum(found["normal"] * normals, axis=1)
     if name == "plane":
-        assert found["sided"].max() < 0.05  # both of its sides are seen alike
+        assert found["one_sided"].max() < 0.05  # both of its sides are seen alike
         cosine = np.abs(cosine)
     else:
-        assert np.mean(found["sided"] > 0.95) > 0.99
+        assert np.mean(found["one_sided"] > 0.95) > 0.99
         assert np.mean(cosine > 0) > 0.995
     assert np.rad2deg(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1))) < degrees
     ratio = found["spacing"] / spacing
@@ -60,11 +60,11 @@ def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbor
 
 
 def test_the_shape_is_0_in_a_plane_and_on_a_line():
-    planarity, linearity = estimate(shape("plane", 600)[0])["shape"].T
+    planarity, linearity = estimate(shape("plane", 600)[0])["shape_ratios"].T
     assert planarity.max() < 0.01
     assert np.quantile(linearity, 0.1) > 0.5
     line = np.linspace(-0.9, 0.9, 300)[:, None] * [0.6, 0, 0.8]
-    assert estimate(line)["shape"][:, 1].max() < 0.01
+    assert estimate(line)["shape_ratios"][:, 1].max() < 0.01
 
 
 def test_the_block_of_a_point_and_its_order_among_others_change_nothing():
@@ -85,7 +85,7 @@ def test_normals_that_are_given_are_kept_and_those_of_the_wrong_sign_turned():
     wrong = np.random.default_rng(1).uniform(size=(800, 1)) < 0.3
     found = estimate(positions, normals=np.where(wrong, -3 * tilted, 3 * tilted))
     close(found["normal"], tilted, atol=1e-5)
-    close(found["sided"], 1 - RULES.leak, atol=1e-6)  # a little weight from behind
+    close(found["one_sided"], 1 - CONSTANTS.back_weight, atol=1e-6)  # a little weight from behind
 
 
 def test_a_normal_given_on_a_sheet_keeps_its_sign():
@@ -108,10 +108,10 @@ def cube(count):
 
 def ends(found, count):
     """Where each disc ends in its four directions (points, 4, 3), and how far from the point, in spacings."""
-    rim = found.rim[:count]
+    rim = found.rim_tangent[:count]
     side = np.cross(found.normal[:count], rim)
     ways = np.stack([rim, -rim, side, -side], axis=1)
-    reach = np.minimum(found.reach[:count], RADIUS)[..., None]
+    reach = np.minimum(found.rim_distances[:count], RADIUS)[..., None]
     return found.position[:count, None] + ways * reach * found.spacing[:count, None, None], reach[..., 0]
 
 
@@ -123,9 +123,11 @@ def test_discs_end_where_the_faces_of_a_cube_meet(known, share):
     assert found.mask.sum() == len(positions)
     places, reach = ends(found, len(positions))
     beyond = (np.abs(places).max(axis=(1, 2)) - 0.5) / spacing
-    assert np.mean(beyond < RULES.edge + 0.15) > share
-    edge = np.sort(np.abs(positions), axis=1)[:, 1] > 0.5 - 0.5 * spacing  # near an edge: cut there, and not sooner
-    assert np.mean(beyond[edge] > -0.2) > share
+    assert np.mean(beyond < CONSTANTS.cut_margin + 0.15) > share
+    cut_margin = (
+        np.sort(np.abs(positions), axis=1)[:, 1] > 0.5 - 0.5 * spacing
+    )  # near an edge: cut there, and not sooner
+    assert np.mean(beyond[cut_margin] > -0.2) > share
     assert np.median(reach[np.sort(np.abs(positions), axis=1)[:, 1] < 0.3]) == pytest.approx(RADIUS, abs=0.2)
 
 
@@ -152,4 +154,4 @@ def test_the_sides_of_a_thin_wall_face_away_from_each_other_and_keep_their_colou
     found = estimate(positions, color)
     inner = np.hypot(u, v) < 0.5
     assert np.mean(found["normal"][inner, 1] * sign[inner] > 0.9) > 0.97
-    assert np.mean(np.abs(found["jump"][inner]).max(axis=1) < 0.1) > 0.97
+    assert np.mean(np.abs(found["color_jump"][inner]).max(axis=1) < 0.1) > 0.97

@@ -23,16 +23,16 @@ def sky():
 
 @jax.jit
 def drawn(found, light, view):
-    found = shader.turn_to_camera(found, view)
-    entries, _ = splatting.entries(found, view, room=2**15)
-    buffer = splatting.blend(entries, found, shader.attributes(found, light, view), view, slots=24**2)
-    return buffer, *shader.features(buffer, light, view)
+    found = shader.face_camera(found, view)
+    entries, _ = splatting.make_entries(found, view, capacity=2**15)
+    buffer = splatting.blend(entries, found, shader.compute_attributes(found, light, view), view, slots=24**2)
+    return buffer, *shader.compute_inputs(buffer, light, view)
 
 
 def test_normals_of_discs_seen_from_behind_are_turned_to_the_camera_and_others_kept():
     positions, normal, spacing = shape("sphere", 500)
     found, view = surfels(positions, normal, spacing), camera(24)
-    turned = shader.turn_to_camera(found, view).normal
+    turned = shader.face_camera(found, view).normal
     towards = np.asarray(view.cam_to_world)[:, 3] - positions
     assert np.all(np.sum(towards * np.asarray(turned), axis=1) >= 0)
     close(turned, normal * np.where(np.sum(towards * normal, axis=1) < 0, -1, 1)[:, None])
@@ -46,9 +46,9 @@ def test_the_network_sees_no_light():
     close(one, other)
 
 
-@pytest.mark.parametrize(("name", "column"), [("guessed", 30), ("invented", 31)])
+@pytest.mark.parametrize(("name", "column"), [("materials_unknown", 30), ("learned", 31)])
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_one_number_says_whether_materials_are_guessed_and_one_whether_points_are_and_no_other_does(
+def test_one_input_says_whether_materials_are_unknown_and_one_whether_points_are_learned_and_no_other_does(
     name, column, share
 ):
     positions, normal, spacing = shape("sphere", 500)
@@ -89,12 +89,12 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
     zeros, ones = jnp.zeros((32, 32)), jnp.ones((32, 32))
     normal = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (32, 32, 3))
     buffer = shader.GBuffer(
-        opacity=ones, coverage=ones, depth=depth, spread=zeros, log_spacing=jnp.log(0.1 * ones),
+        opacity=ones, coverage=ones, depth=depth, depth_deviation=zeros, log_spacing=jnp.log(0.1 * ones),
         normal=normal, color=normal, attributes=jnp.full((32, 32, 19), 0.5),
-        centres=ones, beside=jnp.zeros((32, 32, 2)),
+        sharp_weight=ones, centre_offset=jnp.zeros((32, 32, 2)),
     )  # fmt: skip
     view = Camera(cam_to_world=jnp.eye(3, 4), intrinsics=camera(32).intrinsics, height=32, width=32)
-    seen, _ = jax.jit(shader.features)(buffer, light_of(sky()), view)
+    seen, _ = jax.jit(shader.compute_inputs)(buffer, light_of(sky()), view)
     for column in (7, 8):
         assert seen[8, 8, column] > 0.3
         assert seen[24, 24, column] < -0.3

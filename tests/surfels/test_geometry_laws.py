@@ -17,7 +17,7 @@ from spnr_jax.surfels import geometry
 from spnr_jax.surfels.layers import NEIGHBORS
 
 COUNT, SIZE = 150, 160  # real points, and with padding
-CONSTANT = ("visible", "sided", "mask")  # to gradients
+CONSTANT = ("visibility", "one_sided", "mask")  # to gradients
 
 
 @functools.cache

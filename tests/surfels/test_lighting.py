@@ -9,12 +9,12 @@ from support.surfel_clouds import surfels
 
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import lighting, skies
-from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, directions, light_of, resample, solid_angles
+from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of, resample, solid_angles, texel_directions
 from spnr_jax.surfels.sides import DIRECTIONS
 
 COLOR = np.array([0.3, 1.0, 2.0])
 irradiance, reflect, look_up = map(jax.jit, (lighting.irradiance, lighting.reflect, lighting.look_up))
-arriving, project_harmonics = jax.jit(lighting.arriving), jax.jit(lighting.project_harmonics)
+arriving, project_harmonics = jax.jit(lighting.gather_irradiance), jax.jit(lighting.project_harmonics)
 harmonics = jax.jit(lighting.harmonics)
 
 
@@ -47,7 +47,7 @@ def test_all_tables_of_constant_light_are_that_light():
 
 def test_roughness_passes_through_the_levels_without_jumps():
     light = jax.tree.map(jnp.asarray, light_of(envmap()))
-    towards = directions(HEIGHT)[5, 7]
+    towards = texel_directions(HEIGHT)[5, 7]
     for level, roughness in enumerate(LEVELS):
         expected = light.tables[1 + level, 5, 7]
         for off in (-1e-6, 0, 1e-6):
@@ -57,7 +57,7 @@ def test_roughness_passes_through_the_levels_without_jumps():
 
 def test_everything_is_linear_in_the_map():
     one, other = envmap(1), envmap(2)
-    found = surfels(numbers(0, 30, 3), jnp.asarray(DIRECTIONS[:30]), 0.1, visible=numbers(1, 30, 64, low=0.0))
+    found = surfels(numbers(0, 30, 3), jnp.asarray(DIRECTIONS[:30]), 0.1, visibility=numbers(1, 30, 64, low=0.0))
     towards, roughness = columns(DIRECTIONS), numbers(2, 64, low=0.0)
     turn = np.float32([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])
 
@@ -92,9 +92,9 @@ class TestLookUp:
         return jnp.asarray(envmap(4).reshape(-1, 3))
 
     def test_the_middle_of_a_texel_has_its_value_and_half_way_the_mean_of_its_neighbours(self):
-        found = look_up(self.table(), columns(directions(HEIGHT)))
+        found = look_up(self.table(), columns(texel_directions(HEIGHT)))
         close(jnp.stack(found, axis=-1), self.table(), rtol=1e-3, atol=1e-3)
-        corners = directions(2 * HEIGHT)[2::2, 2::2][: HEIGHT - 1, : WIDTH - 1]
+        corners = texel_directions(2 * HEIGHT)[2::2, 2::2][: HEIGHT - 1, : WIDTH - 1]
         turned = np.stack(look_up(self.table(), columns(corners)), axis=-1).reshape(*corners.shape)
         texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
         mixed = sum(
@@ -117,21 +117,23 @@ class TestLookUp:
 
 
 def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradiance():
-    light = light_of(smooth(directions(HEIGHT)).astype(np.float32))
+    light = light_of(smooth(texel_directions(HEIGHT)).astype(np.float32))
     found = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1)
     open_light = np.stack(irradiance(light, columns(DIRECTIONS)), axis=-1)
     close(arriving(found, light), open_light, rtol=0.08, atol=0.05)
-    blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visible=np.zeros((64, 64)))
+    blind = surfels(np.zeros((64, 3)), DIRECTIONS, 0.1, visibility=np.zeros((64, 64)))
     assert np.all(np.asarray(arriving(blind, light)) == 0)
 
 
 def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_camera():
-    basis = np.stack(harmonics(*columns(directions(HEIGHT))))
+    basis = np.stack(harmonics(*columns(texel_directions(HEIGHT))))
     close(basis * solid_angles(HEIGHT).reshape(-1) @ basis.T, np.eye(9), atol=5e-3)
     constant = project_harmonics(light_of(np.ones((32, 64, 3), np.float32)), np.eye(3, dtype=np.float32))
     close(constant, np.eye(9)[:, :1] * 4 * 0.282095 * np.ones(3), atol=5e-3)
     ahead = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a camera that looks along -x, where z is x
-    tilted = project_harmonics(Light(tables=light_of(smooth(directions(HEIGHT)).astype(np.float32)).tables), ahead)
+    tilted = project_harmonics(
+        Light(tables=light_of(smooth(texel_directions(HEIGHT)).astype(np.float32)).tables), ahead
+    )
     close(tilted[2, 0], 4 / 3 * 0.488603, rtol=1e-2)  # red is 1 + x, and behind the camera is +x
     close(tilted[np.array([1, 3]), 0], np.zeros(2), atol=1e-2)
 
@@ -158,9 +160,9 @@ def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_
 def test_a_lamp_throws_what_it_is_said_to_and_shines_from_where_it_is_said_to(azimuth, elevation, size):
     envmap = skies.lamp(azimuth, elevation, size, (1.0, 0.5, 2.0))
     area = solid_angles(skies.HEIGHT)[..., None]
-    facing = np.maximum(directions(skies.HEIGHT) @ skies.towards(azimuth, elevation), 0)[..., None]
+    facing = np.maximum(texel_directions(skies.HEIGHT) @ skies.direction_from_angles(azimuth, elevation), 0)[..., None]
     close((envmap * facing * area).sum(axis=(0, 1)), np.array([1.0, 0.5, 2.0]), rtol=1e-4)
-    middle = (envmap[..., :1] * directions(skies.HEIGHT) * area).sum(axis=(0, 1))
+    middle = (envmap[..., :1] * texel_directions(skies.HEIGHT) * area).sum(axis=(0, 1))
     turn, rise = np.deg2rad([azimuth, elevation])  # from +z towards +x, and up
     place = np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
     close(middle / np.linalg.norm(middle), place, atol=0.02)

@@ -6,24 +6,24 @@ import numpy as np
 from support.surfel_clouds import shape
 
 from spnr_jax.surfels import sides
-from spnr_jax.surfels.sides import DIRECTIONS, cell_of, grid_of, see_directions, tangents
+from spnr_jax.surfels.sides import DIRECTIONS, choose_cell, choose_grid, compute_visibility, tangents
 
 GRID = 64
-_seen_from = jax.jit(see_directions, static_argnames="grid")
+_seen_from = jax.jit(compute_visibility, static_argnames="grid")
 
 
 def seen(positions, normals, spacing, mask=None):
-    """`see_directions` of NumPy arrays with points equally far apart."""
+    """`compute_visibility` of NumPy arrays with points equally far apart."""
     count = len(positions)
     arrays = (jnp.asarray(np.asarray(x, np.float32).T) for x in (positions, np.broadcast_to(normals, (count, 3))))
     mask = jnp.asarray(np.ones(count, bool) if mask is None else mask)
-    cell = cell_of(jnp.float32(spacing), GRID)
+    cell = choose_cell(jnp.float32(spacing), GRID)
     return np.asarray(_seen_from(*arrays, jnp.full(count, spacing, jnp.float32), mask, cell, grid=GRID)).T
 
 
 def loop(positions, normals, spacing):
     """The same in float64, cell by cell."""
-    cell, grid = float(cell_of(jnp.float32(spacing), GRID)), GRID
+    cell, grid = float(choose_cell(jnp.float32(spacing), GRID)), GRID
     out = np.zeros((len(positions), len(DIRECTIONS)))
     for d, axes in enumerate(zip(DIRECTIONS, *tangents(DIRECTIONS), strict=True)):
         towards, right, up = np.float64(axes)
@@ -38,7 +38,7 @@ def loop(positions, normals, spacing):
         buffer = {}
         for p, n in zip(positions, normals, strict=True):
             column, row = (int(np.floor(p @ axis / cell + grid / 2 - 0.5)) for axis in (right, up))
-            most = sides.REACH * spacing * np.sqrt(1 - (n @ towards) ** 2)
+            most = sides.DISC_RADIUS * spacing * np.sqrt(1 - (n @ towards) ** 2)
             for place in ((row + i, column + j) for i in (0, 1) for j in (0, 1)):
                 nearer = in_the_middle(p, n, *place[::-1])
                 depth = p @ towards + (nearer if nearer < most else 0)
@@ -92,12 +92,12 @@ def test_a_plane_of_random_points_never_hides_itself_at_whatever_angle():
 
 def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells():
     for count in 2 ** np.arange(25):
-        grid = grid_of(int(count))
+        grid = choose_grid(int(count))
         assert sides.COARSEST <= grid <= sides.FINEST
         assert grid % 16 == 0
         for spacing in np.geomspace(1e-7, 3.0, 20):
-            cell = float(cell_of(jnp.float32(spacing), grid))
+            cell = float(choose_cell(jnp.float32(spacing), grid))
             assert cell * grid >= sides.BOX * (1 - 1e-6)
             assert cell >= sides.CELL * spacing * (1 - 1e-6)
-    assert grid_of(16384) == 512
-    assert grid_of(2**24) == sides.FINEST
+    assert choose_grid(16384) == 512
+    assert choose_grid(2**24) == sides.FINEST

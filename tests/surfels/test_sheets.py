@@ -26,7 +26,7 @@ def lined_ball(gap):
 
 @jax.jit
 def _both_layers(points):
-    return [geometry.find_layers(points, None, sided=True, sheets=sheets)[1] for sheets in (False, True)]
+    return [geometry.find_layers(points, None, oriented=True, split_by_color=sheets)[1] for sheets in (False, True)]
 
 
 def layers_of(positions, colors):
@@ -35,7 +35,7 @@ def layers_of(positions, colors):
     padded = pad(cloud(positions, base_color=colors), 2 * COUNT)
     number = np.ascontiguousarray(neighbors(padded).T)
     columns = (np.float32(x).T for x in (padded.positions, padded.base_color))
-    points = geometry.Points(number, padded.mask, np.zeros(2 * COUNT, bool), *columns)
+    points = geometry.PointColumns(number, padded.mask, np.zeros(2 * COUNT, bool), *columns)
     return jax.tree.map(lambda x: np.asarray(x)[..., :count], _both_layers(points))
 
 
@@ -55,7 +55,7 @@ def test_skin_and_lining_face_away_from_each_other_and_are_one_sheet_of_one_colo
     inward_share = np.mean(np.sum(normal * place, axis=1)[~outer] < 0)
     assert outward_share > 0.99
     assert inward_share > 0.97 or np.mean(~outer) < 0.02  # what is not drawn does not show through, either
-    assert np.abs(found.jump[found.mask][outer]).max(axis=1).mean() < 0.02  # no black in the white
+    assert np.abs(found.color_jump[found.mask][outer]).max(axis=1).mean() < 0.02  # no black in the white
     assert changed(positions, np.full_like(colors, 0.5)) == 0
 
 

@@ -12,18 +12,18 @@ from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
 from spnr_jax.surfels import splatting
-from spnr_jax.surfels.splatting import shares
+from spnr_jax.surfels.splatting import compute_blend_weights
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
 blend = jax.jit(splatting.blend, static_argnames="slots")
-make_entries = jax.jit(splatting.entries, static_argnames="room")
-count = jax.jit(lambda found, view: splatting.count_entries(splatting.footprints(found, view).covered))
+make_entries = jax.jit(splatting.make_entries, static_argnames="capacity")
+count = jax.jit(lambda found, view: splatting.count_entries(splatting.project_discs(found, view).covered))
 
 
 def draw(found, view, attributes=None):
     """G-buffer (as NumPy arrays) of surfels, and the entries that it was blended from."""
     attributes = found.base_color if attributes is None else attributes
-    entries, lost = make_entries(found, view, room=TOTAL)
+    entries, lost = make_entries(found, view, capacity=TOTAL)
     assert int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(count(found, view)) <= TOTAL
     assert int(lost) == 0
     assert int(splatting.count_covered_pixels(entries)) <= view.height * view.width
@@ -41,14 +41,14 @@ def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
 
 def blend_twin(entries, found, view, pixel):
     """Opacity, coverage, depth, spread, log spacing, normal and attributes of one pixel, in float64."""
-    order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: splatting.LIST]
+    order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: splatting.LIST_LENGTH]
     point = np.asarray(entries.point)[order]
     kernel, facing, depth = (np.float64(x)[order] for x in (entries.kernel, entries.facing, entries.depth))
     spacing, weight = np.float64(found.spacing)[point], kernel**2 * facing
-    lists = (x[:, None] for x in (splatting.OPACITY * weight, depth, spacing))
-    share, left = (x[:, 0] for x in reference.shares(*lists, splatting.NEAR))
+    lists = (x[:, None] for x in (splatting.CENTRE_TAU * weight, depth, spacing))
+    share, left = (x[:, 0] for x in reference.shares(*lists, splatting.COMPARED))
     opacity = share.sum()
-    divisor = max(opacity, splatting.LEAST_SHARE)
+    divisor = max(opacity, splatting.LEAST_OPACITY)
     mean = share @ depth / divisor
     spread = np.sqrt(share @ (depth - mean) ** 2 / divisor)
     normal = np.float64(found.normal)[point] @ np.float64(view.cam_to_world)[:, :3]
@@ -65,14 +65,14 @@ class TestShares:
 
     def test_those_of_thin_layers_are_those_of_a_float64_loop(self):
         dense, (tau, *others) = 0.005, self.lists(0, 6.0)
-        share, left = shares(*map(jnp.asarray, (dense * tau, *others)))
-        expected, behind = reference.shares(dense * tau, *others, splatting.NEAR)
+        share, left = compute_blend_weights(*map(jnp.asarray, (dense * tau, *others)))
+        expected, behind = reference.shares(dense * tau, *others, splatting.COMPARED)
         close((share / dense, left), (expected / dense, behind), rtol=2e-5, atol=2e-6)
 
     def test_layers_that_are_well_apart_add_up_to_the_opacity_of_their_optical_depth(self):
         depth = np.repeat([1.0, 2.0, 3.0, 5.0], 6)[:, None] + 0.04 * np.sort(numbers(0, 4, 6), axis=1).reshape(-1, 1)
         tau = numbers(1, 24, 1, low=0.0, high=0.4)
-        share, left = shares(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
+        share, left = compute_blend_weights(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
         close(np.sum(share), -np.expm1(-np.sum(tau)), rtol=1e-5)
         close(left[6:12], np.full((6, 1), np.exp(-np.sum(tau[:6]))), rtol=1e-5)
 
@@ -81,7 +81,7 @@ class TestEntries:
     def test_they_are_all_pairs_of_a_float64_loop_over_discs_and_pixels_also_for_a_wide_view(self):
         position, normal, _ = shape("sphere", 40, "random")
         reach = np.random.default_rng(6).uniform(0.2, 2, (40, 4))
-        found = surfels(position, normal, 0.25, reach=reach)
+        found = surfels(position, normal, 0.25, rim_distances=reach)
         view = camera(20, (0.9, 0.8, 0.9), field_of_view=1.9)
         _, entries = draw(found, view)
         table = np.zeros((40, 400))
@@ -92,17 +92,17 @@ class TestEntries:
         directions, eye = np.float64(rays.directions).reshape(-1, 3), np.float64(view.cam_to_world[:, 3])
         pixels, _ = cameras.project(view, found.position)
         places = np.stack(np.meshgrid(*[np.arange(20) + 0.5] * 2), axis=-1).reshape(-1, 2)
-        facing = np.asarray(splatting.footprints(found, view).facing) > 0
+        facing = np.asarray(splatting.project_discs(found, view).facing) > 0
         for i, (p, n) in enumerate(zip(np.float64(position), np.float64(normal), strict=True)):
             slope = directions @ n
             hit = eye + directions * ((n @ (p - eye)) / np.where(abs(slope) < 0.05, np.nan, slope))[:, None]
-            rim = np.float64(found.rim[i])
+            rim = np.float64(found.rim_tangent[i])
             side = np.cross(n, rim)
             ends = [e + (p - hit) @ way / 0.25 for e, way in zip(reach[i], (rim, -rim, side, -side), strict=True)]
             kept = np.prod([np.clip(0.5 + e / splatting.RIM_WIDTH, 0, 1) for e in ends], axis=0)
             within = ((hit - p) ** 2).sum(axis=1) / (splatting.RADIUS * 0.25) ** 2
-            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.FLOOR**2
-            drawn = np.max([kept - within, splatting.SKIRT * (1 - within), on_picture], axis=0)
+            on_picture = 1 - ((places - np.asarray(pixels)[i]) ** 2).sum(axis=1) / splatting.MIN_RADIUS**2
+            drawn = np.max([kept - within, splatting.RIM_SKIRT * (1 - within), on_picture], axis=0)
             clear = np.isfinite(drawn) & (directions @ (hit - eye).T[:, 0] > -9)
             expected = facing[i] * np.clip(drawn, 0, 1)
             close(table[i][clear], expected[clear], atol=2e-3)
@@ -111,7 +111,7 @@ class TestEntries:
         found = layer(20, normal=(0, 1, 1))
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
-            entries, lost = make_entries(found, view, room=int(count(found, view)))
+            entries, lost = make_entries(found, view, capacity=int(count(found, view)))
             slots = splatting.count_covered_pixels(entries)
             assert int(lost) == 0
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
@@ -126,9 +126,9 @@ class TestEntries:
 
     def test_discs_that_do_not_fit_are_left_out_whole_and_counted(self):
         found, view = layer(20, normal=(0, 1, 1)), camera(20)
-        covered = np.asarray(splatting.footprints(found, view).covered)
+        covered = np.asarray(splatting.project_discs(found, view).covered)
         room = int(covered[:12].sum()) + 1
-        entries, lost = make_entries(found, view, room=room)
+        entries, lost = make_entries(found, view, capacity=room)
         assert int(lost) == covered[12:].sum() > 0
         live = np.asarray(entries.pixel) < 400
         drawn = np.asarray(entries.point)[np.asarray(entries.order)[live]]
@@ -136,27 +136,27 @@ class TestEntries:
 
     def test_numbers_that_int32_does_not_hold_do_not_wrap(self):
         found, view = layer(500), camera(16000, eye=(0.0, 0.0, 0.06))
-        assert np.int64(splatting.footprints(found, view).covered).sum() > 2**31
-        assert int(make_entries(found, view, room=2**12)[1]) == splatting.MOST
+        assert np.int64(splatting.project_discs(found, view).covered).sum() > 2**31
+        assert int(make_entries(found, view, capacity=2**12)[1]) == splatting.MOST_COUNTED
 
 
 class TestBlend:
     @settings(hypotheses, max_examples=12)
     @given(st.integers(0, 999), st.floats(-2, -0.6), st.floats(0, 1), st.floats(1, 4))
-    def test_every_pixel_is_that_of_a_float64_loop_over_its_list(self, seed, size, sided, away):
+    def test_every_pixel_is_that_of_a_float64_loop_over_its_list(self, seed, size, one_sided, away):
         rng = np.random.default_rng(seed)
         normal = rng.normal(size=(500, 3))
         found = surfels(
             *(rng.uniform(-0.6, 0.6, (500, 3)), normal / np.linalg.norm(normal, axis=1, keepdims=True)),
             0.3 * 10.0**size * rng.uniform(0.5, 1, 500),
             base_color=rng.uniform(size=(500, 3)),
-            sided=sided * rng.uniform(size=500),
+            one_sided=one_sided * rng.uniform(size=500),
         )
         view = camera(24, (0.0, 0.6 * away, 0.8 * away))
-        entries, lost = make_entries(found, view, room=TOTAL)
+        entries, lost = make_entries(found, view, capacity=TOTAL)
         assume(int(lost) == 0 and int(splatting.count_covered_pixels(entries)) > 0)
         buffer = blend(entries, found, found.base_color, view, slots=24**2)
-        names = ("opacity", "coverage", "depth", "spread", "log_spacing", "normal", "attributes")
+        names = ("opacity", "coverage", "depth", "depth_deviation", "log_spacing", "normal", "attributes")
         entries, buffer = jax.tree.map(np.asarray, (entries, buffer))
         for pixel in rng.choice(entries.pixel[entries.pixel < 24**2], 3):
             ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
@@ -171,7 +171,8 @@ class TestBlend:
         color = np.where(ahead[:, None], 0.5, 0.5 + jump)
         jumps = np.where(ahead[:, None], jump, -jump)
         buffer, _ = draw(
-            surfels(found.position, (0, 0, 1.0), found.spacing, base_color=color, border=border, jump=jumps), view
+            surfels(found.position, (0, 0, 1.0), found.spacing, base_color=color, color_edge=border, color_jump=jumps),
+            view,
         )
         rays = np.asarray(cameras.camera_rays(view).directions)
         hit = [0, 0, 2.5] - 2.5 * rays / rays[..., 2:]
@@ -187,11 +188,11 @@ class TestBlend:
         buffer, _ = draw(found, view)
         (centre, *_), _ = cameras.project(view, found.position)
         columns, rows = np.meshgrid(*[np.arange(view.width) + 0.5] * 2)
-        near = buffer.centres > 0.1
+        near = buffer.sharp_weight > 0.1
         assert 10 < near.sum() < (buffer.opacity > 0.1).sum()
         expected = np.stack([centre[0] - columns, centre[1] - rows], axis=-1)
-        close(buffer.beside[near], expected[near], atol=0.01 * np.abs(expected[near]).max())
-        close(np.hypot(*buffer.beside[buffer.centres == buffer.centres.max()].T).min(), 0.5, atol=0.5)
+        close(buffer.centre_offset[near], expected[near], atol=0.01 * np.abs(expected[near]).max())
+        close(np.hypot(*buffer.centre_offset[buffer.sharp_weight == buffer.sharp_weight.max()].T).min(), 0.5, atol=0.5)
 
     @pytest.mark.parametrize("seed", [0, 1])
     def test_it_is_continuous_in_the_camera(self, seed):
@@ -201,11 +202,15 @@ class TestBlend:
         normal = np.concatenate([normal, clutter / np.linalg.norm(clutter, axis=1, keepdims=True)])
         color = rng.uniform(size=(500, 3))
         found = surfels(
-            np.concatenate([position, clutter]), normal, spacing, base_color=color, sided=rng.uniform(size=500) < 0.7
+            np.concatenate([position, clutter]),
+            normal,
+            spacing,
+            base_color=color,
+            one_sided=rng.uniform(size=500) < 0.7,
         )
         one, other = (draw(found, camera(24, (0.3 + step, 0.2, 2.4)))[0] for step in (0.0, 1e-6))
         assert np.abs(one.opacity - other.opacity).max() < 2e-4
-        assert np.abs(one.centres - other.centres).max() < 2e-4
-        for name in ("attributes", "normal", "color", "beside"):
+        assert np.abs(one.sharp_weight - other.sharp_weight).max() < 2e-4
+        for name in ("attributes", "normal", "color", "centre_offset"):
             change = one.opacity[..., None] * getattr(one, name) - other.opacity[..., None] * getattr(other, name)
             assert np.abs(change).max() < 2e-4, name

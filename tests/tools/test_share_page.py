@@ -15,7 +15,7 @@ from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
 from spnr_jax.tools import export, surfaces
-from spnr_jax.tools.commands import Share, SplatMaking
+from spnr_jax.tools.commands import Share, SplatOptions
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
@@ -90,7 +90,7 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     stripes = np.where(np.sin(6 * points[:, :1]) > 0, [200, 40, 30], [30, 60, 200])
     np.savetxt(tmp_path / "ball.txt", np.concatenate([points, stripes], axis=1), fmt="%.5f")
-    making = SplatMaking(fitting_views=12, most_splats=8000)
+    making = SplatOptions(fitting_views=12, most_splats=8000)
     options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
     assert export.share(options, lambda line: None).startswith(f"wrote {options.out} (")
     poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())

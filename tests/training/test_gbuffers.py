@@ -38,7 +38,7 @@ def grouped(views):
 
 def made(seed, number):
     item = data_sets.read_object(tiny_surfels.dataset(), NAME)
-    return gbuffers.make(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
+    return gbuffers.make_views(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
 
 
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
@@ -76,7 +76,7 @@ def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_b
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    again = gbuffers.complete(tiny_surfels.dataset(), LIGHT, CONFIG, folder, {})
+    again = gbuffers.make_missing(tiny_surfels.dataset(), LIGHT, CONFIG, folder, {})
     assert [view._replace(path=view.path.name) for view in again] == [v._replace(path=v.path.name) for v in views]
     assert broken.read_bytes() == whole
     assert {path for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]} == {broken}
@@ -93,7 +93,7 @@ def test_batches_are_a_function_of_seed_and_step():
         assert a.doublings == b.doublings
         same_bits(a, b)
     other = gbuffers.make_batch(grouped(views), dataclasses.replace(CONFIG, seed=1), 0)
-    assert other.doublings != whole[0].doublings or not np.array_equal(other.seen, whole[0].seen)
+    assert other.doublings != whole[0].doublings or not np.array_equal(other.inputs, whole[0].inputs)
 
 
 def test_steps_meet_every_resolution_in_its_share_with_crops_of_its_size(monkeypatch):
@@ -150,7 +150,10 @@ def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is_and_is_its_
     whole = gbuffers.crop_square(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
     turned = gbuffers.mirror(whole, axis)
     losses = [
-        loss(params, Crops(**{name: x[None] for name, x in one.items()}, doublings=kept.doublings))[0]
+        loss(
+            params,
+            Crops(**{name.replace("seen", "inputs"): x[None] for name, x in one.items()}, doublings=kept.doublings),
+        )[0]
         for one in (whole, turned)
     ]
     np.testing.assert_allclose(*losses, rtol=1e-5)
@@ -169,15 +172,16 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
     for sign in (np.ones(3, np.float32), mirror):
-        columns = {"base_color": color, "jump": color[:, ::-1] - color, "roughness": color[:, 0], "shape": color[:, :2]}
-        columns |= {"metallic": color[:, 1], "guessed": color[:, 2], "invented": color[:, 0], "rim": rim * sign}
+        columns = {"base_color": color, "color_jump": color[:, ::-1] - color, "shape_ratios": color[:, :2]}
+        columns |= {"roughness": color[:, 0], "metallic": color[:, 1], "materials_unknown": color[:, 2]}
+        columns |= {"learned": color[:, 0], "rim_tangent": rim * sign}
         surfels = surfel_clouds.surfels(
             0.8 * normal * sign, normal * sign, 0.4, **columns,
-            border=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
-            visible=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
-            reach=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
+            color_edge=np.concatenate([rim * sign, np.full((60, 1), 0.1, np.float32)], axis=1),
+            visibility=np.maximum((normal * sign) @ DIRECTIONS.T, 0),
+            rim_distances=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
         )  # fmt: skip
-        seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, room=2**14, slots=24 * 24)[0]))
+        seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, capacity=2**14, slots=24 * 24)[0]))
     view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
     np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)
     assert np.abs(seen[1][..., shader.ODD[axis]]).mean() > 0.1
@@ -256,10 +260,10 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(m
 
 def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
     dataset = tiny_surfels.dataset()
-    assert gbuffers.light_of(dataset) is lighting.room_light()
+    assert gbuffers.choose_light(dataset) is lighting.room_light()
     other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
     with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
-        gbuffers.light_of(other)
+        gbuffers.choose_light(other)
 
 
 def test_networks_of_rays_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):

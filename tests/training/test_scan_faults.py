@@ -12,13 +12,13 @@ def rng() -> np.random.Generator:
 
 def test_faults_change_what_their_names_say_and_nothing_else():
     points, values = spiral(4000), {"roughness": np.arange(4000.0), "metallic": np.ones(4000)}
-    moved, same = batching.noisy(points, values, rng(), sigma=0.02)
+    moved, same = batching.add_noise(points, values, rng(), sigma=0.02)
     assert same is values
     np.testing.assert_allclose((moved - points).std(), 0.02, rtol=0.05)
-    more, columns = batching.with_outliers(points, values, rng(), share=0.02)
+    more, columns = batching.add_outliers(points, values, rng(), share=0.02)
     assert len(more) == len(columns["roughness"]) == 4080
     np.testing.assert_array_equal(more[:4000], points)
-    flat = batching.colours_alone(points, values, rng())[1]
+    flat = batching.drop_materials(points, values, rng())[1]
     assert [set(flat[name]) for name in ("roughness", "metallic", "materials_known")] == [{0.5}, {0.0}, {0.0}]
     moved = batching.misregister(points, values, rng(), sigma=0.01)[0] - points
     apart = np.linalg.norm(moved, axis=1) > 1e-9
@@ -35,7 +35,7 @@ def test_faults_change_what_their_names_say_and_nothing_else():
 def test_colours_in_light_are_darkest_where_the_lamp_grazes_and_never_brighter():
     points = spiral(4000)
     values = {"base_color": np.full((4000, 3), 0.6), "normals": points}
-    shade = batching.colours_in_light(points, values, rng())[1]["base_color"][:, 0] / 0.6
+    shade = batching.bake_light(points, values, rng())[1]["base_color"][:, 0] / 0.6
     cosine = np.abs(points @ (lamp := rng().normal(size=3)) / np.linalg.norm(lamp))
     assert shade.max() <= 1
     order = np.argsort(cosine)
@@ -59,7 +59,7 @@ def test_a_random_scan_is_a_function_of_its_generator_and_keeps_columns_beside_p
 def test_scanners_see_less_the_fewer_they_are_and_only_the_outside():
     points = np.concatenate([spiral(4000), 0.5 * spiral(1000)])
     values = {"roughness": np.arange(5000.0)}
-    seen = [batching.scan(points, values, rng(), scanners=n) for n in (1, 3, 20)]
+    seen = [batching.simulate_scanners(points, values, rng(), scanners=n) for n in (1, 3, 20)]
     counts = [len(positions) for positions, _ in seen]
     assert 1000 < counts[0] < 2000
     assert counts == sorted(counts)
@@ -70,7 +70,7 @@ def test_scanners_see_less_the_fewer_they_are_and_only_the_outside():
 
 
 def test_uneven_density_thins_one_end():
-    thin = batching.uneven(spiral(20000), {}, rng())[0]
+    thin = batching.thin_unevenly(spiral(20000), {}, rng())[0]
     assert 0.2 < len(thin) / 20000 < 0.6
     along = np.sort(thin @ rng().normal(size=3))
     low, high = np.count_nonzero(along < along[0] + 0.3), np.count_nonzero(along > along[-1] - 0.3)

@@ -76,13 +76,13 @@ def test_a_ball_is_drawn_in_the_middle_red_on_its_left_whatever_the_shape_of_the
 def test_the_square_holds_the_object_and_covers_the_canvas_where_that_is_asked_for(whole):
     seen = view(width=300, height=60)
     covering = 5 * np.tan(0.35)
-    close(frame.square_reach(seen, whole), covering if whole else np.tan(np.arcsin(frame.OBJECT / 4)), rtol=1e-6)
+    close(frame.square_reach(seen, whole), covering if whole else np.tan(np.arcsin(frame.OBJECT_RADIUS / 4)), rtol=1e-6)
     inside = dataclasses.replace(seen, position=0.1 * seen.position)
     aside = dataclasses.replace(seen, position=np.array([9.0, 0, 1]))
     assert frame.square_reach(inside, whole) == frame.square_reach(aside, whole) == pytest.approx(covering)
     for size in ((2**16, 2), (2, 2**16)):
         wide = view(width=size[0], height=size[1])
-        filled = frame.fill(np.zeros((8, 8, 3), np.uint8), wide, frame.square_reach(wide, whole=True), 96)
+        filled = frame.place_square(np.zeros((8, 8, 3), np.uint8), wide, frame.square_reach(wide, whole=True), 96)
         assert max(filled.shape) == 96, "no canvas is drawn larger than asked for"
         assert (filled == 0).all()
 

@@ -16,7 +16,7 @@ from data_gen.plan import tasks
 from data_gen.render.light import Lights
 from data_gen.store import check, layout, show
 from spnr_jax.formats import data_sets
-from spnr_jax.surfels.lighting import directions
+from spnr_jax.surfels.lighting import texel_directions
 
 VIEWS = 6
 SMALL = ["--resolution", 32, "--views", VIEWS, "--points", 64, "--spp", 16, "--visibility-grid", 2]
@@ -65,7 +65,7 @@ def test_a_view_is_brighter_where_the_map_that_is_kept_says_that_its_light_comes
     agreeing = []
     for view, light in enumerate(item.lights):
         weight = area[..., 0] * light.mean(axis=-1)
-        across = (weight[..., None] * directions(32)).sum(axis=(0, 1)) @ item.camera.cam_to_world[view][:, :3]
+        across = (weight[..., None] * texel_directions(32)).sum(axis=(0, 1)) @ item.camera.cam_to_world[view][:, :3]
         image, inside = item.images[view, ..., :3].mean(axis=-1), item.images[view, ..., 3] > 250
         grid = np.stack(np.meshgrid(np.arange(32) - 15.5, 15.5 - np.arange(32)), axis=-1)
         gradient = np.linalg.lstsq(grid[inside], image[inside] - image[inside].mean(), rcond=None)[0]

@@ -6,7 +6,7 @@ from support.handmade import ball, plain
 
 from data_gen.render import light, views
 from spnr_jax.formats.assets import Asset
-from spnr_jax.surfels.lighting import directions
+from spnr_jax.surfels.lighting import texel_directions
 from spnr_jax.surfels.skies import indoor_envmap
 
 
@@ -32,7 +32,7 @@ def test_a_white_diffuse_sphere_averages_0_6_under_the_scaled_map(room):
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_light_from_a_direction_of_the_map_falls_on_that_side_of_an_object(axis, sign):
     towards = sign * np.eye(3)[axis]
-    envmap = (directions(32) @ towards > 0.8)[..., None] * np.ones(3, np.float32) * 5
+    envmap = (texel_directions(32) @ towards > 0.8)[..., None] * np.ones(3, np.float32) * 5
     scene = views.build_scene(Asset(parts=(ball(radius=0.6, material=plain()),)), envmap)
     config = views.ViewConfig(resolution=8, spp=16)
     lit = views.render_view(scene, views.look_at(3 * towards + 0.01), config, 0)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from spnr_jax.devices.runtime import DIED, run_tasks
+from data_gen.make.workers import DIED, run_tasks
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def double_or_die(state, task):
@@ -46,7 +46,7 @@ def test_tasks_without_end_are_taken_as_they_are_needed(tmp_path):
 
 SLEEPER = """
 import os, time
-from spnr_jax.devices.runtime import run_tasks
+from data_gen.make.workers import run_tasks
 
 def sleep(state, task):
     os.write(1, b"begun\\n")  # at once: both tasks write to the same pipe
