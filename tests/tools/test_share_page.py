@@ -3,10 +3,8 @@
 Chromium is found on PATH, or named by SPNR_CHROMIUM; without one these tests are skipped.
 """
 
-import base64
 import contextlib
 import io
-import re
 
 import numpy as np
 import pytest
@@ -14,8 +12,7 @@ from PIL import Image
 from support import chromium as chromium_of
 from support import splat_balls, splat_twin
 
-from spnr_jax.tools import export, surfaces
-from spnr_jax.tools.commands import Share, SplatMaking
+from spnr_jax.tools import export
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 
@@ -82,22 +79,6 @@ def test_the_page_draws_what_the_poster_shows_and_its_title_is_only_text(chromiu
         assert tab.title() == tab.locator("h1").inner_text() == title
         assert decibels(shown(tab), poster) > 32
         assert tab.locator("#poster").count() == 0, "the poster makes place"
-
-
-def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, monkeypatch):
-    monkeypatch.setattr(surfaces, "RESOLUTION", SIZE)
-    points = np.random.default_rng(0).normal(size=(3000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    stripes = np.where(np.sin(6 * points[:, :1]) > 0, [200, 40, 30], [30, 60, 200])
-    np.savetxt(tmp_path / "ball.txt", np.concatenate([points, stripes], axis=1), fmt="%.5f")
-    making = SplatMaking(fitting_views=12, most_splats=8000)
-    options = Share(cloud=tmp_path / "ball.txt", out=tmp_path / "page.html", up="y", making=making)
-    assert export.share(options, lambda line: None).startswith(f"wrote {options.out} (")
-    poster = re.search(r'src="data:image/jpeg;base64,([^"]+)"', options.out.read_text())
-    network = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster[1])))) / np.float32(255)
-    with opened(chromium, options.out) as tab:
-        assert decibels(shown(tab), network) > 24, "20 are asked for"
-        assert decibels(np.ones_like(network), network) < 15
 
 
 def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_path):
