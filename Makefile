@@ -56,7 +56,8 @@ test: setup
 	$(PY) -m pytest -q -rsfE -n 2 --dist loadfile --durations=25 -m "not slow and not ci"
 
 # the longest files first, so that no worker is left with one of them at the end; files without such tests are not read
-CI_FIRST := $(addprefix tests/,laws/test_laws.py test_documents.py test_wheel.py experiments/test_commands.py)
+CI_FIRST := $(addprefix tests/,test_documents.py experiments/test_commands.py robustness/test_chaos.py test_wheel.py \
+	robustness/test_many_devices.py laws/test_laws.py)
 CI_FILES = $(CI_FIRST) $(filter-out $(CI_FIRST),$(shell grep -rl --include='test_*.py' 'mark\.ci' tests))
 
 test-ci: setup

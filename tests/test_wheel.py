@@ -72,7 +72,7 @@ def environment(wheel, tmp_path_factory):
     output_of(sys.executable, "-m", "venv", "--without-pip", folder)
     (packages,) = folder.glob("lib/python*/site-packages")
     for distribution in dependencies.values():
-        for name in {file.parts[0] for file in distribution.files} - {".."}:
+        for name in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
             (packages / name).symlink_to(distribution.locate_file(name))
     extras = (line for lines in PROJECT["optional-dependencies"].values() for line in lines)
     along = {canonicalize_name(Requirement(line).name) for line in extras} & dependencies.keys()

@@ -95,24 +95,6 @@ def test_fewer_training_objects_than_there_are_leave_some_aside():
     assert split["test"] == planned(test_objects=10, val_fraction=0.1).split(ids(planned().tasks))["test"]
 
 
-HERE = Path(__file__).parent
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"root": HERE}, "only with --preset"),
-        ({"preset": "abo"}, "--preset abo: give --root"),
-        ({"preset": "abo", "meshes": HERE}, "not together"),
-        ({"objects": 8, "test_objects": 8}, "--test-objects 8: leaves none of the 8"),
-        ({"colour_variants": -1}, "--colour-variants: expected 0 or more"),
-        ({"train_objects": 0}, "--train-objects: expected 1 or more"),
-    ],
-)
-def test_options_that_do_not_go_together_are_one_line(options, expected):
-    assert expected in error(**options)
-
-
 def test_a_preset_is_the_default_of_the_options_and_they_override_it():
     for name, preset in tasks.PRESETS.items():
         made = parse([*OUT, "--preset", name, "--root", "data", "--spp", "16"])
