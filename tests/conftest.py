@@ -11,16 +11,21 @@ makes millions of objects, among which the garbage collector looks less often th
 import gc
 import os
 import signal
+from pathlib import Path
 
 import jax
 from jaxtyping import install_import_hook
 
+ROOT = Path(__file__).parents[1]
 QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 LONG = 0.3  # seconds of a compilation that is kept
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()  # read at the first use
 
 gc.set_threshold(100_000, 50, 50)
-install_import_hook(["spnr_jax", "experiments.baselines"], "beartype.beartype")
+modules = [path.relative_to(ROOT).with_suffix("").parts for path in sorted((ROOT / "spnr_jax").rglob("*.py"))]
+# of options annotations are not executed: tyro's mark of a missing value stands for a Path
+checked = [".".join(parts) for parts in modules if parts[-1] not in ("__init__", "commands", "cli")]
+install_import_hook([*checked, "experiments.baselines"], "beartype.beartype")
 
 # a shell that starts the suite in the background has it ignore Ctrl-C, and its children with it
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -10,12 +10,11 @@ import pytest
 from support import command_line, tiny_dataset
 
 import spnr_jax
-from spnr_jax import methods
+from spnr_jax import cli, methods
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 
-cli = command_line.unchecked_cli()
 PAGE = (Path(__file__).parents[1] / "docs" / "own_network.md").read_text()
 SOURCE = re.search(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
 

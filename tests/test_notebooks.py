@@ -4,6 +4,7 @@ import json
 import warnings
 from pathlib import Path
 
+import jax
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
@@ -34,7 +35,7 @@ def test_every_object_is_drawn_from_every_side(workplace):
         exec(compile("".join(cell["source"]), f"code cell {number}", "exec"), names)
     drawn = np.asarray(names["draw"](names["objects"]))
     assert drawn.shape[:2] == (8, 4)
-    np.testing.assert_allclose(drawn[3], names["pictures"](names["each"][3]), atol=1e-4)
+    np.testing.assert_allclose(drawn[3], jax.jit(names["pictures"])(names["each"][3]), atol=1e-4)
     assert len(plt.get_fignums()) == 2
 
 

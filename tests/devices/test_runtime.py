@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import platform
 import subprocess
 import sys
 import threading
@@ -57,52 +56,18 @@ def test_of_work_for_two_threads_the_first_is_done_alone_and_two_meet_at_most():
     assert list(two_at_a_time(int, [])) == []
 
 
-glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
-FAULTS = """
-import resource, sys
-from spnr_jax.devices import runtime
-
-if sys.argv[1] == "keep":
-    runtime.reuse_memory()
-import jax
-
-@jax.jit
-def step(x, w):
-    y = x @ w  # 64 MB
-    return y.T @ y
-
-x, w = jax.numpy.ones((64 << 10, 256)), jax.numpy.ones((256, 256))
-faults = []
-for _ in range(6):  # the first ones find no memory, or one piece where two are in use
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    step(x, w).block_until_ready()
-    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-print(min(faults))
-"""
-
-
-@pytest.mark.ci
-@glibc
-def test_a_step_uses_the_memory_of_the_one_before_when_it_is_kept():
-    def faults(asked):
-        done = subprocess.run([sys.executable, "-c", FAULTS, asked], capture_output=True, text=True, check=True)
-        return int(done.stdout)
-
-    fresh = faults("let go")
-    assert fresh >= 32, "64 MB in pages of 2 MB at most"
-    assert faults("keep") < fresh / 4
-
-
-def test_the_c_library_is_asked_for_as_many_arenas_as_cores_and_to_give_freed_memory_back(monkeypatch):
+def test_the_c_library_is_asked_to_keep_freed_memory_to_give_it_back_and_for_as_many_arenas_as_cores(monkeypatch):
     asked = []
     glibc = SimpleNamespace(
         malloc_trim=lambda *of: asked.append(("malloc_trim", *of)), mallopt=lambda *of: asked.append(("mallopt", *of))
     )
     monkeypatch.setattr(ctypes, "CDLL", lambda name: glibc if name == "libc.so.6" else None)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    runtime.reuse_memory()
     runtime.limit_arenas()
     runtime.trim_memory()
-    assert asked == [("mallopt", runtime.ARENA_MAX, 3), ("malloc_trim", 0)]
+    kept = [("mallopt", runtime.MMAP_MAX, 0), ("mallopt", runtime.TRIM_THRESHOLD, 2**31 - 1)]
+    assert asked == [*kept, ("mallopt", runtime.ARENA_MAX, 3), ("malloc_trim", 0)]
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
     runtime.limit_arenas()  # another C library is left alone
 

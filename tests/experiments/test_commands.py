@@ -12,14 +12,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support import stand_ins, tiny_dataset, tiny_surfels
+from support import tiny_dataset, tiny_surfels
 from support.tiny_baselines import SHRUNKEN, SIZE
 from support.tiny_untrained import CONFIG as L1_ONLY
 
 from data_gen.render import views
 from data_gen.store import layout
 from experiments import entry_point
-from experiments.comparison import poisson
+from experiments.comparison import contenders, poisson
 from experiments.comparison.variants import Budget
 from experiments.packaged import demo
 from experiments.paper import fig2, fig3, table1
@@ -53,11 +53,8 @@ def _tiny(monkeypatch):
         monkeypatch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
-    monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": stand_ins.stand_in()})
-    fresh = {weights.PACKAGED: tiny_surfels.untrained()}
-    monkeypatch.setattr(
-        weights, "packaged_file", lambda name=weights.PACKAGED: fresh.get(name) or tiny_surfels.PACKAGED(name)
-    )
+    monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": contenders.Method(draw=draw_grey)})
+    monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
     monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
 
@@ -84,6 +81,13 @@ def data(tmp_path_factory):
     return SimpleNamespace(lit=lit, painted=painted, varied=varied, run=lambda: str(tiny_surfels.untrained()))
 
 
+def draw_grey(_, item):
+    """Every pixel of the object, grey and at one depth."""
+    acc = item.images[..., 3] / np.float32(255)
+    image = np.repeat(np.where(acc > 0, 0.5, 1)[..., None], 3, axis=-1)
+    return evaluation.Pictures(image=image, acc=acc, depth=np.full(acc.shape, 2.5, np.float32))
+
+
 def check_sharpness(found):
     assert len(found["objects"]) == 2  # network and discs
     assert all(scores["encode"] > 0 for (scores,) in found["objects"].values())
@@ -100,7 +104,7 @@ def check_speed_accuracy(found):
 
 def check_fig3(found):
     for ours in found["scores"]["Ours"]:
-        assert ours["median"] == pytest.approx(stand_ins.OFFSET, abs=0.1)
+        assert 0 < ours["median"] < 1
         assert ours["missed"] == 0
 
 
@@ -166,12 +170,13 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
 }
 
 
+SLOW = pytest.mark.slow  # its gradient alone takes a minute to compile
+
+
 @pytest.mark.ci
-@pytest.mark.parametrize("name", RUNS)
-def test_a_command_ends_with_finite_numbers_and_pictures_and_goes_on_where_it_was(name, data, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW if x == "studies.inverse" else ()) for x in RUNS])
+def test_a_command_ends_with_finite_numbers_and_pictures_and_goes_on_where_it_was(name, data, tmp_path):
     options, pictures, check = RUNS[name]
-    if name == "studies.inverse":  # a network of zeros stands on kinks, where gradients are not differences
-        monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
     found, out = run_twice(name, tmp_path / "out", **options(data))
     for picture in pictures:
         assert (out / picture).read_bytes().startswith(b"\x89PNG")

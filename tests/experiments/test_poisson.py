@@ -121,12 +121,6 @@ def test_a_sphere_of_points_is_a_closed_sphere_that_faces_outwards_in_the_colour
     np.testing.assert_array_equal(part.material.base_color, 1)
 
 
-def test_a_missing_solver_is_one_line_that_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pymeshlab", None)
-    with pytest.raises(ValueError, match=r"^Poisson[^\n]*pip install[^\n]*baselines[^\n]*$"):
-        poisson.reconstruct(sphere_cloud(), QUICK)
-
-
 def test_roughness_and_metal_of_vertices_are_rendered_where_they_are():
     # one half of a ball is a mirror, the other matt: it looks as the two balls of one material do
     lamp = np.random.default_rng(7).random((8, 16, 3)).astype(np.float32)

@@ -11,23 +11,7 @@ from experiments.comparison import results_folder, scores, study_objects
 from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
-from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training import weights
-
-ROWS = (
-    ("ours_1", (number(21.456, 2, (20.0, 22.5), best=True), number(0.25, 1, factor=100))),
-    ("50 % & more", (number(None, 2), number(-1.0, 1, sign="+"))),
-    ("absent", (text("not run: no solver"),)),
-)
-TABLE = Table(title="A title", heads=("PSNR, dB\N{NO-BREAK SPACE}\N{UPWARDS ARROW}", "share, %"), rows=ROWS)
-
-
-def test_markdown_has_a_row_for_each_row_all_as_wide_as_the_head():
-    lines = [line for line in results_folder.markdown([TABLE], ["how"]).splitlines() if line.startswith("|")]
-    assert len(lines) == 2 + len(ROWS)
-    assert {line.count("|") for line in lines} == {4}
-    assert "**21.46** [20.00, 22.50]" in lines[2]
-    assert [cell.strip() for cell in lines[3].split("|")[2:4]] == ["n/a", "-1.0"]
 
 
 @pytest.mark.parametrize(

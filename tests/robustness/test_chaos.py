@@ -25,8 +25,8 @@ from support.tiny_dataset import CONFIG
 from spnr_jax import cli
 from spnr_jax.training import checkpoint, trainer
 
-KILLS = int(os.environ.get("CHAOS_KILLS", "1"))  # of each quarter of the training
-STEPS = max(24, 4 * KILLS)
+KILLS = int(os.environ.get("CHAOS_KILLS", "2"))
+STEPS = max(24, KILLS)
 CHECKPOINT_EVERY, LONGEST_DELAY = 8, 0.3  # seconds: a checkpoint takes some tenths
 LIMIT = 300.0  # seconds after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
@@ -79,7 +79,7 @@ def whole(tmp_path_factory):
 @pytest.mark.ci
 def test_a_training_that_was_killed_ends_with_the_same_bits_and_rows(whole):
     rng, run = np.random.default_rng(0), whole.with_name("killed")
-    for step in np.sort(rng.uniform(0, STEPS - CHECKPOINT_EVERY, 4 * KILLS)):
+    for step in np.sort(rng.uniform(0, STEPS - CHECKPOINT_EVERY, KILLS)):
         assert train(run, step, rng.uniform(0, LONGEST_DELAY)) == -9, run.with_name("killed.txt").read_text()
     assert train(run) == 0, run.with_name("killed.txt").read_text()
     (config, state), (expected_config, expected) = checkpoint.load_run(run), checkpoint.load_run(whole)

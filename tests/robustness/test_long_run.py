@@ -23,7 +23,8 @@ from spnr_jax.training import checkpoint, trainer
 STEPS = int(os.environ.get("LONG_RUN_STEPS", "0"))
 COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's name of the event
 PHASES = ((trainer, "take_step"), (trainer.MetricsLog, "write"), (trainer, "preview"), (checkpoint, "save"))
-QUICK = dataclasses.replace(SHRUNKEN["points2nerf_tiny"], batch_objects=2)  # no convolutions: compiles in a second
+SMALL = SHRUNKEN["points2nerf_tiny"]  # no convolutions: compiles in a second
+QUICK = dataclasses.replace(SMALL, batch_objects=2, model=dataclasses.replace(SMALL.model, hidden_width=6))
 
 
 class Witness:
@@ -61,7 +62,6 @@ def holdings():
 
 def watch(config, run, dataset, **schedule):
     seen = Witness()
-    jax.clear_caches()  # another test may have drawn a preview
     jax.monitoring.register_event_duration_secs_listener(seen.note)
     try:
         with pytest.MonkeyPatch.context() as patch:

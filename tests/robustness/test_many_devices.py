@@ -25,7 +25,7 @@ def test_eight_devices_train_as_one_in_float64_and_go_on_from_its_checkpoint(tmp
     command = [sys.executable, here / "many_devices.py", tmp_path]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout.splitlines()[-1])
-    assert max(found["gradients"].values()) < 1e-9, found
+    assert found["gradients"] < 1e-9, found
     assert found["trained"] < 1e-5, found
 
 

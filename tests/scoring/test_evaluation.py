@@ -1,6 +1,5 @@
 """Scores are those of the metrics called by hand on the files' pictures; nothing is left out unsaid."""
 
-import dataclasses
 import shutil
 
 import jax
@@ -17,7 +16,7 @@ from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import METRICS, flip
-from spnr_jax.training import checkpoint, optimisation, weights
+from spnr_jax.training import checkpoint, optimisation
 
 NAMES = tiny_dataset.SPLITS["test"]
 ssim, cpsnr = jax.jit(metrics.ssim), jax.jit(metrics.conditional_psnr)
@@ -77,17 +76,6 @@ def test_a_summary_is_the_mean_over_all_images_with_its_counts(outcome, results)
     assert set(outcome.summary["settings"]["radius factors"].values()) <= set(evaluation.RADIUS_FACTORS)
 
 
-def test_networks_are_compared_under_the_names_that_they_are_given(monkeypatch):
-    trained, dataset = weights.read_trained(tiny_untrained.run()), tiny_dataset.dataset()
-    monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.0)
-    one = dataclasses.replace(dataset, splits=dataset.splits | {"test": NAMES[:1]})
-    summary = evaluation.compare({"ours": trained, "paper": trained}, one, say=lambda line: None).summary
-    assert list(summary["methods"]) == ["ours", "paper", *evaluation.FLOORS]
-    assert summary["methods"]["ours"] == summary["methods"]["paper"]
-    assert summary["ours_minus"]["paper"]["psnr"]["mean"] == 0
-    assert summary["settings"]["networks"] == dict.fromkeys(("ours", "paper"), {"preset": "tiny", "steps": 0})
-
-
 def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch):
     real, asked = data_sets.read_object, []
     monkeypatch.setattr(data_sets, "read_object", lambda dataset, name: asked.append(name) or real(dataset, name))
@@ -103,17 +91,10 @@ def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch)
     assert means[chosen] == max(means.values())
 
 
-@pytest.mark.parametrize(
-    ("split", "expected"),
-    [
-        ("test", "test split is empty; score --split train or --split val, or generate .* --test-objects N"),
-        ("train", "no training objects"),
-    ],
-)
-def test_an_empty_split_is_an_error_that_names_it(split, expected, tmp_path):
+def test_an_empty_training_split_is_an_error_that_names_it(tmp_path):
     copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
-    (copy / "splits" / f"{split}.txt").write_text("")
-    with pytest.raises(ValueError, match=expected):
+    (copy / "splits" / "train.txt").write_text("")
+    with pytest.raises(ValueError, match="no training objects"):
         evaluation.evaluate(tiny_untrained.run(), data_sets.open_dataset(copy), say=lambda line: None)
 
 

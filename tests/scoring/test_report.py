@@ -148,12 +148,6 @@ def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     assert "p < 0.001" in page.all("small")
 
 
-def test_the_page_says_everywhere_which_objects_it_scores(tmp_path):
-    page, words = write(tmp_path), "objects of the val split"
-    assert page.all("h1") == page.all("title") == [f"Sparse-point neural rendering: {words}"]
-    assert f"on 30 views of 3 {words}: " in page.all("p")[0]
-
-
 def test_durations_are_said_in_the_units_that_people_use():
     spoken = {8.44: "8.4 s", 59.96: "1 min 0 s", 119.7: "2 min 0 s", 3599.9: "1 h 0 min", 7503: "2 h 5 min"}
     assert {seconds: duration(seconds) for seconds in spoken} == spoken

@@ -1,8 +1,10 @@
 """Training of the shader network in seconds: one ball of 40 points, its G-buffers of 12 pixels, few features."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from spnr_jax.method import surfel_method
 from spnr_jax.surfels import lighting
 from spnr_jax.training import checkpoint, gbuffers, optimisation, trainer, weights
 from support import tiny_dataset
+from support.laws import numbers
 from support.stopped_runs import PICTURE
 
 SIZE = 48
@@ -60,13 +63,14 @@ def run() -> Path:
 
 @functools.cache
 def untrained() -> Path:
-    """A run folder with fresh weights: for what asks whether it runs, not how good it is."""
-    folder = tiny_dataset.folder() / "fresh_surfels"
+    """A run folder with random weights (fresh ones end in zeros): for what asks whether it runs, not how well."""
+    folder, state = tiny_dataset.folder() / "fresh_surfels", optimisation.jitted_create_state(CONFIG)
     checkpoint.write_config(folder, CONFIG)
-    checkpoint.save(folder, optimisation.jitted_create_state(CONFIG))
+    averaged = jax.tree.map(lambda x: x + 0.02 * numbers(0, *x.shape), state.averaged)
+    checkpoint.save(folder, dataclasses.replace(state, averaged=averaged))
     return folder
 
 
 def shipped(name: str = weights.PACKAGED) -> Path:
-    """The package's files of weights, but for its network: that is `run`."""
-    return run() if name == weights.PACKAGED else PACKAGED(name)
+    """The package's files of weights, but for its network: that is `untrained`."""
+    return untrained() if name == weights.PACKAGED else PACKAGED(name)

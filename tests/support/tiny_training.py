@@ -1,4 +1,4 @@
-"""Training of the shrunken network: two configs, a batch of two coloured balls, and steps that keep their input."""
+"""Training of the shrunken network: two configs, a batch of two painted balls, and steps that keep their input."""
 
 import dataclasses
 
@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import LossConfig, OptimizerConfig, TrainConfig
-from spnr_jax.kernels.cameras import look_at, pinhole
-from spnr_jax.kernels.records import Batch, PointCloud
-from spnr_jax.training import optimisation
+from spnr_jax.training import batching, optimisation
 from support.laws import close
-from support.tiny_model import MODEL, NUM_POINTS, SIZE
+from support.tiny_dataset import NAMES, one_object
+from support.tiny_model import MODEL, NUM_POINTS
 
 CONFIG = TrainConfig(
     model=MODEL,
@@ -27,37 +26,7 @@ create = optimisation.jitted_create_state
 copied = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))
 
 
-def batch():
-    """Two coloured balls on white, each seen from its own side."""
-    directions = np.random.default_rng(0).normal(size=(2, NUM_POINTS, 3)).astype(np.float32)
-    positions = 0.5 * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    colors = np.float32([[0.8, 0.2, 0.1], [0.1, 0.3, 0.7]])
-    eyes = np.float32([[[0, 0.5, 2.5]], [[2.5, 0.5, 0]]])
-    pose = look_at(jnp.asarray(eyes), jnp.zeros(eyes.shape), jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), eyes.shape))
-    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
-    disc = np.broadcast_to((np.hypot(rows, columns) < 0.3 * SIZE)[None, None], (2, 1, SIZE, SIZE))
-    image = np.where(disc[..., None], colors[:, None, None, None], np.float32(1))
-    points = np.broadcast_to(colors[:, None], (2, NUM_POINTS, 3))
-    cloud = PointCloud(
-        positions=positions,
-        base_color=points,
-        roughness=points[..., 0],
-        metallic=points[..., 1] * 0,
-        mask=np.ones((2, NUM_POINTS), bool),
-    )
-    mask = disc & (np.random.default_rng(1).uniform(size=disc.shape) < 0.2)
-    made = Batch(
-        cloud=cloud,
-        camera=pinhole(pose, 0.6, SIZE, SIZE),
-        image=image,
-        alpha=disc.astype(np.float32),
-        condition=image * mask[..., None],
-        condition_mask=mask,
-    )
-    return jax.tree.map(jnp.asarray, made)
-
-
-BATCH = batch()
+BATCH = jax.tree.map(jnp.asarray, batching.make_batch([one_object(name) for name in NAMES[:2]], CONFIG, 0))
 
 
 def step(state, config=CONFIG, data=BATCH):

@@ -68,7 +68,7 @@ def test_what_cannot_be_exported_or_loaded_is_refused_in_one_line(make, message)
 def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     options = {"num_points": POINTS, "resolution": SIZE, "platforms": ("cpu", "cuda")}
-    cli.run(cli.Export(run=tiny_surfels.run(), out=tmp_path, **options))
+    cli.run(cli.Export(run=tiny_surfels.untrained(), out=tmp_path, **options))
     capsys.readouterr()
     functions = {f"{name}.{kind}" for name in ("encode", "render") for kind in ("jax", "stablehlo")}
     assert {path.name for path in tmp_path.iterdir()} == functions | {"weights.npz", "light.npz", "export.json"}
@@ -76,7 +76,7 @@ def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions
     said = json.loads((tmp_path / "export.json").read_text())
     assert said["render"]["platforms"] == ["cpu", "cuda"]
     assert said["encode"]["outputs"] == said["render"]["inputs"][0], "the volume goes from one to the other"
-    model = spnr_jax.load(tiny_surfels.run())
+    model = spnr_jax.load(tiny_surfels.untrained())
     positions, normals, _ = shape("sphere", 110)
     red = np.where(normals[:, :1] > 0, [0.8, 0.1, 0.1], [0.2, 0.4, 0.7])
     points = cloud_arrays.pad(cloud(7 * positions + 3, base_color=red), POINTS)  # far from the box's units

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support import command_line, splat_balls, tiny_surfels
 
+from spnr_jax import cli
 from spnr_jax.formats import images
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import parse_ply
@@ -15,8 +16,6 @@ from spnr_jax.tools import export, surfaces
 from spnr_jax.tools.commands import Lighting, Render
 
 pytestmark = pytest.mark.ci  # it makes splats with the network of the package
-
-cli = command_line.unchecked_cli()
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def small_pictures(monkeypatch):
 
 
 def made_by(*arguments):
-    network = str(tiny_surfels.run())
+    network = str(tiny_surfels.untrained())
     name = "--network" if arguments[0] == "export" else "--run"
     options = (name, network, "--fitting-views", "6", "--up", "y")
     return command_line.exit_code(cli, *arguments, *options)

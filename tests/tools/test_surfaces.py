@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from support import tiny_untrained
-from support.surfel_clouds import cloud
+from support.tiny_model import MODEL
 
-import spnr_jax
-from spnr_jax.kernels.records import Rendering
+from spnr_jax.kernels.records import Rendering, Volume
+from spnr_jax.method.model import Model
 from spnr_jax.tools.surfaces import surface_depth
 
 UNIT = 10.0  # half diagonal of the cloud, in its own units
@@ -14,11 +13,9 @@ UNIT = 10.0  # half diagonal of the cloud, in its own units
 
 @pytest.fixture(scope="module")
 def scene():
-    """Volume and camera of a cube of points that is large and far from 0."""
-    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) * UNIT / np.sqrt(3)
-    model = spnr_jax.load(tiny_untrained.run())
-    volume = model.encode(cloud(corners + [50, 0, -20]))
-    return volume, model.camera(volume, 0.0, 0.0, 24)
+    """Volume and camera of a cloud that is large and far from 0."""
+    volume = Volume(scene=None, centre=np.float32([50, 0, -20]), scale=np.asarray(1 / UNIT, np.float32))
+    return volume, Model(config=MODEL, variables={}).camera(volume, 0.0, 0.0, 24)
 
 
 def rendering(depth, acc):

@@ -19,23 +19,21 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-def newest_files(run, step):
-    return sorted(path for path in (run / "checkpoints" / str(step)).rglob("*") if path.is_file())
+DAMAGES = {
+    "emptied": lambda content: b"",
+    "overwritten": lambda content: b"\xff" * len(content),
+    "halved": lambda content: content[: len(content) // 2],
+    "deleted": None,
+}
 
 
-def emptied(path):
-    path.write_bytes(b"")
-
-
-def overwritten(path):
-    path.write_bytes(b"\xff" * path.stat().st_size)
-
-
-def halved(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-DAMAGES = {"emptied": emptied, "overwritten": overwritten, "halved": halved, "deleted": lambda path: path.unlink()}
+def hurt(run, step, damage):
+    """Every file of a checkpoint is damaged."""
+    for path in [path for path in (run / "checkpoints" / str(step)).rglob("*") if path.is_file()]:
+        if damage is None:
+            path.unlink()
+        else:
+            path.write_bytes(damage(path.read_bytes()))
 
 
 def saved(folder, *steps):
@@ -69,8 +67,7 @@ def test_a_state_comes_back_bit_by_bit(config, tmp_path):
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage, run):
-    for path in newest_files(run, 6):
-        damage(path)
+    hurt(run, 6, damage)
     said = []
     state = checkpoint.restore(run, CONFIG, said.append)
     assert int(state.step) == 4
@@ -81,8 +78,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_taken(damage
 
 def test_a_run_whose_checkpoints_are_all_damaged_is_one_clear_error(run):
     for step in (2, 4, 6):
-        for path in newest_files(run, step):
-            emptied(path)
+        hurt(run, step, DAMAGES["emptied"])
     with pytest.raises(
         ValueError, match="no checkpoint of this run can be read; remove the folder to start again"
     ) as error:

@@ -266,7 +266,7 @@ def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
         gbuffers.choose_light(other)
 
 
-def test_networks_of_rays_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):
+def test_ray_marching_networks_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):
     dataset = dataclasses.replace(tiny_dataset.dataset(), settings={"environment_map": {"kinds": [{"name": "random"}]}})
     with pytest.raises(ValueError, match="preset tiny learns one light alone; train --preset surfels") as refused:
         batching.prepare(tiny_dataset.CONFIG, dataset, tmp_path, light=None)

@@ -1,6 +1,5 @@
 """Training with settings and batches that nobody meant stays finite."""
 
-import functools
 from contextlib import closing
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 from support.tiny_baselines import SHRUNKEN
+from support.tiny_training import BATCH
 
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.training import batching, optimisation
@@ -58,16 +58,9 @@ BATCHES = {
 }
 
 
-@functools.cache
-def first_batch():
-    """A training batch of the painted balls, shared by TAME and WILD."""
-    with closing(batching.batches(tiny_dataset.dataset(), TAME, 0)) as batches:
-        return jax.tree.map(jnp.asarray, next(batches))
-
-
 @pytest.mark.parametrize("name", BATCHES)
 def test_both_networks_stay_finite_in_twenty_steps_on(name):
-    state, batch = optimisation.jitted_create_state(WILD), BATCHES[name](first_batch())
+    state, batch = optimisation.jitted_create_state(WILD), BATCHES[name](BATCH)
     for _ in range(20):
         state, metrics = optimisation.jitted_train_step(state, batch, config=WILD, adversarial=True)
         assert_finite(metrics)

@@ -63,7 +63,7 @@ def test_the_densifier_stands_beside_every_network_over_surfels_and_in_no_file_o
 def test_a_densifier_beside_the_weights_or_in_the_run_comes_before_that_of_the_package(tmp_path):
     own = jax.tree.map(lambda x: x + 1, weights.read_variables(weights.packaged_file("densifier")))
     flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(own, sep="/").items()}
-    shutil.copytree(tiny_surfels.run(), tmp_path / "run")
+    shutil.copytree(tiny_surfels.untrained(), tmp_path / "run")
     for folder in (tmp_path, tmp_path / "run"):
         (folder / "densifier.npz").write_bytes(pack_arrays(flat))
     weights.write_weights(tmp_path / "w.npz", weights.read_trained(None))

@@ -131,11 +131,18 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
         (["--lights", "room", "--envmap", __file__], "not together with --envmap"),
         (["--test-list", "absent.txt"], "not a readable text file"),
         (["--variant", "fast"], "variant: expected auto"),
+        (["--root", "."], "only with --preset"),
+        (["--preset", "abo"], "--preset abo: give --root"),
+        (["--preset", "abo", "--meshes", "."], "not together"),
+        (["--objects", "8", "--test-objects", "8"], "--test-objects 8: leaves none of the 8"),
+        (["--colour-variants", "-1"], "--colour-variants: expected 0 or more"),
+        (["--train-objects", "0"], "--train-objects: expected 1 or more"),
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_2(arguments, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert spnr_data("generate", "out", "--objects", 1, "--variant", "scalar_rgb", *arguments) == 2
+    objects = () if "--preset" in arguments else ("--objects", 1)
+    assert spnr_data("generate", "out", *objects, "--variant", "scalar_rgb", *arguments) == 2
     message = capsys.readouterr().err
     assert expected in message
     assert message.count("\n") == 1

@@ -1,5 +1,6 @@
 """A data set is the same whatever makes it, and whatever becomes of that meanwhile."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -29,7 +30,7 @@ def make(out, *more):
 def start(out, *more):
     """The same as `make` in a process of its own, as a user starts it."""
     command = [sys.executable, "-m", "data_gen", "generate", *options(out), "--variant", "scalar_rgb", *more]
-    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True)
 
 
 def files(folder):
@@ -49,7 +50,7 @@ def with_two_workers_that_are_stopped_and_go_on(folder):
     out = folder / "set"
     process = start(out, "--workers", "2")
     wait_for(out, 1, process)
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: every process gets the signal
     message = process.communicate(timeout=30)[1].decode()
     assert process.returncode == 130, message
     assert "Traceback" not in message

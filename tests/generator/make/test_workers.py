@@ -58,23 +58,14 @@ if __name__ == "__main__":
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_no_worker_outlives_a_parent_that_is_interrupted_or_killed(how, tmp_path):
+def test_no_worker_outlives_a_parent_that_is_killed(tmp_path):
+    """Of one that is interrupted, as a terminal does it: test_same_bytes.py."""
     script = tmp_path / "sleeper.py"
     script.write_text(SLEEPER)
-    parent = subprocess.Popen(
-        [sys.executable, script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        start_new_session=True,
-    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, env=environment)
     assert [parent.stdout.readline() for _ in range(2)] == [b"begun\n"] * 2
     start = time.monotonic()
-    if how == signal.SIGINT:  # as a terminal does it: every process gets the signal
-        os.killpg(parent.pid, how)
-    else:
-        parent.send_signal(how)
-    message = parent.communicate(timeout=20)[1].decode()  # both workers have closed their end
-    assert message.count("Traceback") == (how == signal.SIGINT), "of the script itself"
+    parent.kill()
+    parent.communicate(timeout=20)  # both workers have closed their end
     assert time.monotonic() - start < 10
