@@ -65,6 +65,20 @@ def first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
+@contextlib.contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """UserError, what a file is and why, in place of whatever a library raises that stumbles over it."""
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:
+        if is_bug(error):
+            raise
+        reason = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
+        raise UserError(f"{what} ({reason})") from error
+
+
 def one_line(error: Exception) -> str:
     """What an error says, on one line that a person can read whole; an error of the disk with its place."""
     said = str(error) or type(error).__name__

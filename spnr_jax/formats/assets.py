@@ -39,7 +39,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -56,10 +56,6 @@ MOST_NAMES, LONGEST_NAME = 3, 40  # in a sentence
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
-# what readers of images raise on those that break their rules
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, AttributeError)
-UNREADABLE += (Image.DecompressionBombError, Image.DecompressionBombWarning)
 LEVELS = np.arange(256) / 255  # of 8 bits
 SRGB_TABLE, DIRECTION_TABLE = srgb_to_linear(LEVELS).astype(np.float32), (2 * LEVELS - 1).astype(np.float32)
 
@@ -276,31 +272,28 @@ class Tolerance:
 
 
 def read_image(data: bytes, name: str) -> np.ndarray:
-    """The texels of `decode_image`; RejectedAsset, which names it, for an image that cannot be read."""
-    try:
+    """The texels of `decode_image`; ValueError, which names it, for an image that cannot be read."""
+    with refusing(f"names an image that cannot be read: {name}"):
         return decode_image(data)
-    except UserError as error:
-        raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none.
+
+    ValueError for none, and for too large a one; what is damaged raises whatever Pillow raises.
+    """
     if data.startswith(KTX2):
-        raise UserError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
+        raise ValueError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
     try:
         with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
             image: Image.Image = Image.open(io.BytesIO(data))
-        if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
-            raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-        if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-            image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
-        return np.asarray(image.convert("RGBA"))
     except UnidentifiedImageError:
-        raise UserError("is not an image") from None
-    except UNREADABLE as error:
-        if is_bug(error):
-            raise
-        raise UserError(str(error)) from None
+        raise ValueError("is not an image") from None
+    if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+        raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+    if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+        image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+    return np.asarray(image.convert("RGBA"))
 
 
 def color_texels(encoded: np.ndarray, table: np.ndarray = SRGB_TABLE) -> np.ndarray:

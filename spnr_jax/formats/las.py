@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import extra
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
@@ -29,8 +29,6 @@ COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
 # places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
 SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
 COMPRESSED = 0xC0  # bits of the point format
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
 
 
 def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
@@ -39,15 +37,14 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     _check_header(path)
     try:
-        with laspy.open(path, laz_backend=backends, read_evlrs=False) as scan:
+        with (
+            refusing("is a broken or truncated LAS file"),
+            laspy.open(path, laz_backend=backends, read_evlrs=False) as scan,
+        ):
             present = set(scan.header.point_format.dimension_names)
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
                 yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
-    except (laspy.errors.LaspyException, *UNREADABLE) as error:
-        if is_bug(error):
-            raise
-        raise UserError(f"is a broken or truncated LAS file ({error})") from None
     except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
         if type(error).__name__ != "PanicException":
             raise

@@ -14,7 +14,6 @@ Every reason not to use a file is a RejectedAsset with one line.
 import contextlib
 import hashlib
 import re
-import struct
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.errors import UserError, first_line, is_bug
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import (
     Asset,
     Material,
@@ -46,10 +45,6 @@ MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot 
 WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
 NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
-# What readers raise on files that break their rules; not MemoryError and not an interrupt.
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
-UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
 
 
 def assemble(asset: Asset, strict: bool) -> Asset:
@@ -263,19 +258,18 @@ def points_of(path: Path, kind: str) -> dict[str, np.ndarray] | None:
 def _refusing() -> Iterator[None]:
     """RejectedAsset, meanwhile, where libraries stumble over a file."""
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
+        with (
+            refusing("cannot be read, the file is broken or truncated"),
+            warnings.catch_warnings(),
+            np.errstate(all="ignore"),  # assemble looks for what is not finite
+        ):
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
             yield
     except RejectedAsset:
         raise
-    except UserError as error:  # colours that are none, say
+    except UserError as error:
         raise RejectedAsset(str(error)) from error
-    except UNREADABLE as error:
-        if is_bug(error):
-            raise
-        text = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
-        raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
 
 
 def _safe(name: str) -> str:

@@ -20,10 +20,8 @@ import io
 import math
 import re
 import threading
-import tokenize
 import warnings
 import zipfile
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -31,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import Columns
 
 # --- text -------------------------------------------------------------------------------------------------------------
@@ -191,10 +189,6 @@ def _are_normals(vectors: np.ndarray) -> bool:
 HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
 PIECE_BYTES = 2**25  # of an array in memory at a time
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
-# what NumPy and zipfile raise on files that break their rules
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, RuntimeError, SyntaxError)
-UNREADABLE += (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 ARRAY_COLUMNS = {
     **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
@@ -215,11 +209,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
-    try:
-        with _parsing():
-            loaded = np.lib.format.open_memmap(path, mode="r")
-    except UNREADABLE as error:
-        raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
+    with refusing("is a broken, truncated or pickled NumPy file"), _parsing():
+        loaded = np.lib.format.open_memmap(path, mode="r")
     rows = np.atleast_1d(loaded)
     if rows.ndim == 3:  # the pixels of a picture
         rows = rows.reshape(-1, rows.shape[2])
@@ -245,19 +236,14 @@ def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) 
     An array's size is checked before memory is taken for it: its header must not announce more than its bytes.
     """
     arrays = {}
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            names = [name for name in members if wanted is None or name in wanted]
-            unpacked = sum(members[name].file_size for name in names)
-            if unpacked > MOST_BYTES:
-                raise UserError(
-                    f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
-                )
-            for name in names:
-                arrays[name] = _member(archive, members[name])
-    except UNREADABLE as error:
-        raise UserError(f"is a broken or truncated NumPy file ({error})") from None
+    with refusing("is a broken or truncated NumPy file"), zipfile.ZipFile(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        names = [name for name in members if wanted is None or name in wanted]
+        unpacked = sum(members[name].file_size for name in names)
+        if unpacked > MOST_BYTES:
+            raise UserError(f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces")
+        for name in names:
+            arrays[name] = _member(archive, members[name])
     if not arrays:
         raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
     return arrays

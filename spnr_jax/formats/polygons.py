@@ -18,7 +18,7 @@ import numpy as np
 
 from spnr_jax.formats.assets import Asset, Part, RejectedAsset, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
-from spnr_jax.formats.row_files import element_pieces, join_pieces, read_lists, read_ply_header
+from spnr_jax.formats.row_files import read_elements, read_ply_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 
 TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
@@ -29,11 +29,12 @@ OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
 
 def load_ply_mesh(data: bytes) -> Asset:
     """The raw asset of a PLY file with faces, or strips of them."""
-    element = read_ply_header(io.BytesIO(data)).faces
+    file = io.BytesIO(data)
+    header = read_ply_header(file)
+    element = header.faces
     if element is None:
         return Asset(parts=())
-    vertices = join_pieces(element_pieces(io.BytesIO(data)))
-    of_faces, lists = read_lists(io.BytesIO(data), element)
+    (vertices, _), (of_faces, lists) = read_elements(file, header, "vertex", element).values()
     name = next((name for name in ("vertex_indices", "vertex_index") if name in lists), next(iter(lists), None))
     if name is None:
         raise RejectedAsset("has faces without lists of vertices: broken file")
