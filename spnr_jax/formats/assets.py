@@ -40,7 +40,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import srgb_to_linear
+from spnr_jax.formats.columns import Columns, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
@@ -122,7 +122,8 @@ class Part:
 class Asset:
     """One object: its parts, what kind it is, and what its source holds that is not modelled (named, never silent).
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing.
+    `notes` are sentences about what was made of transparent parts and of files that are missing; `points` the columns
+    of the vertices of a file without faces.
     """
 
     parts: tuple[Part, ...]
@@ -130,6 +131,7 @@ class Asset:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     source: dict = field(default_factory=dict)
+    points: Columns | None = None
 
 
 def make_material(

@@ -26,6 +26,7 @@ from spnr_jax.formats.assets import Asset, ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
+from spnr_jax.formats.surface_points import bounding_box, sample_surface
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, clean_columns
 from spnr_jax.kernels.cloud_arrays import (
@@ -149,7 +150,12 @@ class Points(NamedTuple):
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
-    points = _sample_mesh(path, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
+    if pieces is None:
+        from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
+
+        asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
+        pieces = None if asset.points is None else iter([asset.points])
+    points = _sample_mesh(asset, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
     rows, lines = scenes.object_of(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
@@ -226,14 +232,10 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     return positions + (before - origin), origin
 
 
-def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
+def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.meshes import load_mesh  # here: points are read without trimesh
-    from spnr_jax.formats.surface_points import bounding_box, sample_surface
-
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
     for line in ([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []) + list(asset.notes):
         report(line)
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)

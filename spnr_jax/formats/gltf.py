@@ -13,7 +13,7 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset, Tolerance, TransparentParts
-from spnr_jax.formats.columns import LINEAR, SRGB
+from spnr_jax.formats.columns import LINEAR, SRGB, Columns
 from spnr_jax.formats.gltf_file import (
     BASIS,
     DRACO,
@@ -86,7 +86,9 @@ class Shape(NamedTuple):
 def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The scene's triangles with their materials, as they lie in the file; RejectedAsset if it cannot be used."""
     file, tolerance = GltfFile(path), Tolerance(transparent_parts)
-    document = file.document
+    document, drawn = file.document, list(list_primitives(file))
+    if not tolerance.strict and (points := _points(file, drawn)):
+        return Asset(parts=(), points=points)
     for extension in document.get("extensionsRequired", []):
         if extension not in READABLE and not extension.startswith("KHR_materials_"):
             raise RejectedAsset(f"needs {extension}, which cannot be read: export it without that extension")
@@ -96,7 +98,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     materials: dict[int | None, GltfMaterial] = {}
     shapes: dict[int, Shape] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
-    for primitive, matrix in list_primitives(file):
+    for primitive, matrix in drawn:
         mode = MODES[primitive.get("mode", 4)]
         if not mode.startswith("TRIANGLE"):
             ignored.add(f"{mode} primitives")
@@ -121,13 +123,11 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     return tolerance.asset(parts)
 
 
-def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
+def _points(file: GltfFile, drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
     """The columns of the points of a scene without triangles; None if it has some, or no points either.
 
     Colours are linear, as the specification has them, or display-referred sRGB where a splat says so.
     """
-    file = GltfFile(path)
-    drawn = list(list_primitives(file))
     modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
@@ -141,7 +141,7 @@ def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0] if name in shared}
 
 
-def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
+def _point_columns(file: GltfFile, primitive: dict) -> Columns:
     """The columns of a primitive of points in its own frame, without normals, which nodes turn."""
     attributes = primitive["attributes"]
     columns = dict(zip("xyz", file.accessor(attributes["POSITION"]).T, strict=True))

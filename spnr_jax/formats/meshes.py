@@ -33,9 +33,9 @@ from spnr_jax.formats.assets import (
     make_material,
 )
 from spnr_jax.formats.columns import full_scale
-from spnr_jax.formats.gltf import gltf_points, load_gltf
-from spnr_jax.formats.obj import load_obj, obj_points
-from spnr_jax.formats.polygons import PLAIN, off_points
+from spnr_jax.formats.gltf import load_gltf
+from spnr_jax.formats.obj import load_obj
+from spnr_jax.formats.polygons import PLAIN
 from spnr_jax.formats.surface_points import bounding_box, face_areas, face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
@@ -243,15 +243,9 @@ def load_mesh(
             asset = PLAIN[kind](path.read_bytes())
         else:
             raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-        asset = assemble(asset, transparent_parts == "refuse")
+        strict = transparent_parts == "refuse"
+        asset = asset if asset.points and not strict else assemble(asset, strict)
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
-
-
-def points_of(path: Path, kind: str) -> dict[str, np.ndarray] | None:
-    """The columns of the points of a mesh file that has no faces, for pictures; None where it has some."""
-    readers = {".obj": obj_points, ".off": off_points, ".glb": gltf_points, ".gltf": gltf_points}
-    with _refusing():
-        return readers[kind](path) if kind in readers else None
 
 
 @contextlib.contextmanager

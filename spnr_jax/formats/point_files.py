@@ -116,18 +116,13 @@ def _version(head: bytes, form: str | None) -> str:
 
 
 def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:
-    """The columns of a file of points, some points at a time; None where it has faces; `kind` as kind_of says."""
+    """The columns of a file of points, some points at a time; None for a mesh; `kind` as kind_of says."""
     kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
             if read_ply_header(file).faces:
                 return None
-    if kind in READERS:
-        return READERS[kind](path)
-    from spnr_jax.formats.meshes import points_of  # here: points are read without trimesh
-
-    columns = points_of(path, kind)
-    return None if columns is None else iter([columns])
+    return READERS[kind](path) if kind in READERS else None
 
 
 def parse_ply(content: bytes) -> Columns:

@@ -12,7 +12,6 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -106,6 +105,8 @@ def load_stl(data: bytes) -> Asset:
 def load_off(data: bytes) -> Asset:
     """The raw asset of an OFF file with faces."""
     columns, rows = _off(data)
+    if not rows:
+        return Asset(parts=(), points=columns)
     sizes = np.array([int(row[0]) for row in rows])
     corners = np.concatenate([np.array(row[1 : 1 + size], np.int64) for row, size in zip(rows, sizes, strict=True)])
     if len(corners) < sizes.sum():
@@ -117,12 +118,6 @@ def load_off(data: bytes) -> Asset:
     )
     ignored = ("colours of some faces alone",) if any(behind) and not colored and SRGB[0] not in columns else ()
     return _colored(columns, corners, sizes, of_faces, ignored)
-
-
-def off_points(path: Path) -> Columns | None:
-    """The columns of an OFF file without faces; None if it has some."""
-    columns, rows = _off(path.read_bytes())
-    return None if rows else columns
 
 
 def _off(data: bytes) -> tuple[Columns, list[list[float]]]:
