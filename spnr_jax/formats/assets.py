@@ -38,11 +38,13 @@ from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
+from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import Columns, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
+MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
 ShownParts = Literal["opaque", "skip"]
 # What becomes of parts that light passes through: refuse the object, as references need, draw them as if they were
@@ -329,22 +331,8 @@ def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer
 
 def lookup(texels: np.ndarray, texcoords: np.ndarray, wrap: Wrap) -> np.ndarray:
     """Bilinear values (n,) or (n, c) of a texture (height, width) or (height, width, c) at texcoords (n, 2)."""
-    size = np.array([texels.shape[1], texels.shape[0]])
-    position = np.asarray(texcoords, np.float64) * size - 0.5
-    corner = np.floor(position).astype(np.int64)
-    weight = position - corner
-    (left, top), (right, bottom) = _wrap(corner, size, wrap).T, _wrap(corner + 1, size, wrap).T
-    x, y = (weight[:, axis].reshape(-1, *[1] * (texels.ndim - 2)) for axis in (0, 1))
-    upper = (1 - x) * texels[top, left] + x * texels[top, right]
-    lower = (1 - x) * texels[bottom, left] + x * texels[bottom, right]
-    return (1 - y) * upper + y * lower
-
-
-def _wrap(index: np.ndarray, size: np.ndarray, wrap: Wrap) -> np.ndarray:
-    """Texel indices inside [0, size) for any integer indices."""
-    if wrap == "clamp":
-        return np.clip(index, 0, size - 1)
-    if wrap == "repeat":
-        return index % size
-    folded = index % (2 * size)
-    return np.minimum(folded, 2 * size - 1 - folded)
+    height, width, *channels = texels.shape
+    places = (np.asarray(texcoords, np.float64) * [width, height] - 0.5)[:, ::-1].T
+    flat = np.moveaxis(texels.reshape(height, width, -1), -1, 0)
+    values = [map_coordinates(channel, places, np.float64, order=1, mode=MODES[wrap]) for channel in flat]
+    return np.stack(values, axis=-1).reshape(-1, *channels)
