@@ -26,7 +26,6 @@ from spnr_jax.formats.gltf_file import (
     decode_mesh,
     read_material,
 )
-from spnr_jax.formats.polygons import strip_faces
 from spnr_jax.surfels.gaussians import C0
 
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
@@ -209,4 +208,6 @@ def _triangles(order: np.ndarray, mode: str) -> np.ndarray:
         return np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_FAN":
         return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)
-    return strip_faces(order)
+    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other one of a strip is turned
+    return faces

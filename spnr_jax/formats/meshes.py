@@ -87,9 +87,8 @@ def _without_false_normals(asset: Asset) -> Asset:
     """The asset without normals where most lie across their faces, as those of other axes do."""
     shaded = [part for part in asset.parts if part.normals is not None]
     means = [unit(part.normals[part.faces].sum(axis=1)) for part in shaded if part.normals is not None]
-    cosines = [
-        np.abs(np.sum(mean * unit(face_crosses(part)), axis=-1)) for mean, part in zip(means, shaded, strict=True)
-    ]
+    flat = [unit(face_crosses(part.positions, part.faces)) for part in shaded]
+    cosines = [np.abs(np.sum(mean * normals, axis=-1)) for mean, normals in zip(means, flat, strict=True)]
     if not cosines or not np.median(np.concatenate(cosines)) < ACROSS:
         return asset
     note = "normals of the file left out: they lie across its faces"

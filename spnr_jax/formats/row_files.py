@@ -41,7 +41,6 @@ TYPES = {
 }
 BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_HEADER_LIMIT = 2**20  # bytes
-FACES = ("face", "tristrips")  # elements that make a PLY a mesh
 LONGEST_LIST = 2**20  # items
 
 
@@ -52,9 +51,9 @@ class PlyHeader(NamedTuple):
     elements: list[Element]  # in the order of the file
 
     @property
-    def faces(self) -> str | None:
-        """The element of faces that make it a mesh."""
-        return next((name for name, count, _ in self.elements if name in FACES and count), None)
+    def has_faces(self) -> bool:
+        """Whether it is a mesh."""
+        return any(name == "face" and count for name, count, _ in self.elements)
 
 
 def read_ply_header(file: BufferedIOBase) -> PlyHeader:

@@ -83,7 +83,7 @@ def test_each_hard_file_is_read_or_refused_with_the_right_reason():
                 load_mesh(path)
             continue
         points = sample_surface(normalise(load_mesh(path))[0], 256, 0)
-        assert all(np.isfinite(values).all() for values in vars(points).values())
+        assert all(np.isfinite(values).all() for values in points)
         for values in (points.base_color, points.roughness, points.metallic):
             assert 0 <= values.min() <= values.max() <= 1
         np.testing.assert_allclose(np.linalg.norm(points.normals, axis=-1), 1, atol=1e-5)
