@@ -289,19 +289,19 @@ def test_meshopt_data_is_what_its_encoders_decoder_says_and_cut_anywhere_it_is_r
     theirs, ours = (np.frombuffer(data, "<i2").astype(int) for data in (case["plain"], found))
     np.testing.assert_allclose(ours, theirs, atol=1 if name == ROUNDED else 0)
     for length in {*range(0, len(case["packed"]), 7), len(case["packed"]) - 1}:
-        with pytest.raises(RejectedAsset):
+        with pytest.raises(ValueError):
             unpack(memoryview(case["packed"][:length]), case)
 
 
 def test_meshopt_counts_widths_formats_and_filters_that_cannot_be_are_refused():
     for name in ("colours, format 0", "colours, format 1", "a grid", "a grid as a sequence"):
         for count in (MESHOPT[name]["count"] * 2**6, 3 * 2**28, -3):  # before room is made for them
-            with pytest.raises(RejectedAsset):
+            with pytest.raises(ValueError):
                 unpack(memoryview(MESHOPT[name]["packed"]), MESHOPT[name] | {"count": count})
     case = MESHOPT["noise, format 0"]
     changes = [{"byteStride": stride} for stride in (0, 3, 6, 260)] + [{"packed": b"\xa7" + case["packed"][1:]}]
     for change in (*changes, *({"filter": kind} for kind in ("SEPIA", "QUATERNION", "COLOR"))):
-        with pytest.raises(RejectedAsset, match="broken|cannot be read"):
+        with pytest.raises(ValueError, match="broken|cannot be read"):
             unpack(memoryview((case | change)["packed"]), case | change)
 
 
