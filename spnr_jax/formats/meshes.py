@@ -85,7 +85,7 @@ def _finite(asset: Asset) -> Asset:
 
 def _without_false_normals(asset: Asset) -> Asset:
     """The asset without normals where most lie across their faces, as those of other axes do."""
-    shaded = [part for part in asset.parts if part.normals is not None]
+    shaded = [part for part in asset.parts if part.normals is not None and len(part.faces)]
     means = [unit(part.normals[part.faces].sum(axis=1)) for part in shaded if part.normals is not None]
     flat = [unit(face_crosses(part.positions, part.faces)) for part in shaded]
     cosines = [np.abs(np.sum(mean * normals, axis=-1)) for mean, normals in zip(means, flat, strict=True)]
