@@ -76,30 +76,22 @@ class PlacedCloud:
 class Reading:
     """How a file is read; ValueError for an option that there is not."""
 
-    num_points: int | None = None
-    """More points are thinned out evenly, fewer are kept; a mesh gives exactly so many, or 4096."""
-    up: str = "auto"
-    """The file's upward axis, or "auto"."""
+    num_points: int | None = None  # more points are thinned out evenly, fewer are kept; a mesh gives as many, or 4096
+    up: str = "auto"  # the file's upward axis
     seed: int = 0
-    clean: Clean = "off"
-    """How points, never those of meshes, are cleaned before they are thinned (spnr_jax/kernels/cleaning.py)."""
-    cut: Cut = WHOLE
-    """Which part of a scene is wanted."""
-    transparent_parts: ShownParts = "opaque"
-    """Transparent parts of a mesh are taken as opaque, or left out ("skip")."""
-    report: Report = lambda line: None
-    """Gets a line about every assumption."""
+    clean: Clean = "off"  # how points, never those of meshes, are cleaned before they are thinned (kernels/cleaning.py)
+    cut: Cut = WHOLE  # which part of a scene is wanted
+    transparent_parts: ShownParts = "opaque"  # of a mesh; or left out ("skip")
+    report: Report = lambda line: None  # gets a line about every assumption
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if self.up not in (*ROTATIONS, "auto"):
-            raise UserError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {self.up!r}")
+        choices = {"up": (*ROTATIONS, "auto"), "transparent_parts": get_args(ShownParts), "clean": get_args(Clean)}
+        for name, known in choices.items():
+            if (value := getattr(self, name)) not in known:
+                raise UserError(f"{name} must be one of {', '.join(known)}, got {value!r}")
         if self.num_points is not None and self.num_points < 1:
             raise UserError(f"num_points must be at least 1, got {self.num_points}")
-        if self.transparent_parts not in get_args(ShownParts):
-            raise UserError(f"transparent_parts must be opaque or skip, got {self.transparent_parts!r}")
-        if self.clean not in get_args(Clean):
-            raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {self.clean!r}")
 
 
 def read_cloud(

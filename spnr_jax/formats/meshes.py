@@ -1,4 +1,4 @@
-"""Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
+"""Mesh files as assets: read, checked, cleaned and merged by material.
 
 glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (polygons.py)
 have vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
@@ -13,9 +13,7 @@ Every reason not to use a file is a RejectedAsset with one line.
 
 import contextlib
 import hashlib
-import re
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +42,6 @@ ACROSS = 0.5  # median cosine between normals and faces, below which the normals
 MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
 WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
-NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
 
 
 def assemble(asset: Asset, strict: bool) -> Asset:
@@ -190,35 +187,6 @@ def _merge(parts: list[Part]) -> Part:
     return replace(parts[0], faces=np.concatenate(faces), **whole)
 
 
-def find_meshes(folder: Path) -> list[tuple[str, Path]]:
-    """(object id, file) of every mesh file below a folder, sorted by id; ids are unique and safe as folder names.
-
-    An id is the file's name without suffix, or the folder's name where a .gltf or .obj is alone in a subfolder; names
-    that collide become the whole path. Hidden files and folders are skipped.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder: give a folder of {' '.join(SUFFIXES)} files")
-    relative = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    visible = [p for p in relative if (folder / p).is_file() and not any(part.startswith(".") for part in p.parts)]
-    if not visible:
-        raise UserError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
-    siblings = Counter(path.parent for path in visible)
-    names = []
-    for path in visible:
-        alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
-        names.append(_safe(path.parent.name if alone else path.stem))
-    shared = Counter(name.casefold() for name in names)
-    ids: dict[str, tuple[str, Path]] = {}
-    for name, path in zip(names, visible, strict=True):
-        unique = wanted = name if shared[name.casefold()] == 1 else _safe("_".join(path.parts))
-        number = 2
-        while unique.casefold() in ids or (unique != name and unique.casefold() in shared):
-            unique, number = f"{wanted}-{number}", number + 1
-        ids[unique.casefold()] = unique, folder / path
-    return sorted(ids.values())
-
-
 def load_mesh(
     path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse", kind: str | None = None
 ) -> Asset:
@@ -263,8 +231,3 @@ def _refusing() -> Iterator[None]:
         raise
     except UserError as error:
         raise RejectedAsset(str(error)) from error
-
-
-def _safe(name: str) -> str:
-    """A name of letters, digits, dot, dash and underscore that is no hidden folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "object"

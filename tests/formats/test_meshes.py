@@ -8,8 +8,9 @@ import trimesh
 from PIL import Image
 from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder
 
+from data_gen.plan.sources import find_meshes
 from spnr_jax.formats.assets import RejectedAsset
-from spnr_jax.formats.meshes import find_meshes, load_mesh
+from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
