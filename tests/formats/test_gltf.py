@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, png, textured_square
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
+from support.point_tables import WHOLE, as_scan
 
 from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.gltf_file import metallic_roughness, unpack
 from spnr_jax.formats.meshes import load_mesh
@@ -318,9 +320,14 @@ def test_a_draco_mesh_that_lacks_something_or_is_cut_anywhere_is_refused_in_one_
 
 
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
-    draco = draco_square().write(tmp_path / "a.glb")
-    reads = {"DracoPy": lambda: load_mesh(draco), "meshoptimizer": lambda: unpack(memoryview(b""), MESHOPT["a grid"])}
-    for package, read in reads.items():
-        monkeypatch.setitem(sys.modules, package, None)
-        with pytest.raises(RejectedAsset, match=rf"needs the package {package} .* 'spnr-jax\[meshes\]'"):
-            read()
+    paths = dict.fromkeys(("laspy", "lazrs"), tmp_path / "a.las") | {"meshoptimizer": tmp_path / "mesh.gltf"}
+    paths["DracoPy"] = draco_square().write(tmp_path / "a.glb")
+    as_scan(paths["laspy"], WHOLE)
+    for name, content in meshopt_files().items():
+        (tmp_path / name).write_bytes(content)
+    for package, path in paths.items():
+        extra = "formats" if path.suffix == ".las" else "meshes"
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, package, None)
+            with pytest.raises(ValueError, match=rf"needs the package {package} .* 'spnr-jax\[{extra}\]'"):
+                read_cloud(path)

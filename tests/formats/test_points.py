@@ -3,7 +3,6 @@
 import io
 import pickle
 import struct
-import sys
 import time
 import zipfile
 
@@ -217,14 +216,6 @@ def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z
 def test_a_scan_without_colours_shows_its_intensity(tmp_path):
     as_scan(tmp_path / "a.las", WHOLE, 6)
     assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
-
-
-@pytest.mark.parametrize("package", ["laspy", "lazrs"])
-def test_without_its_packages_one_line_names_the_extra(tmp_path, monkeypatch, package):
-    as_scan(tmp_path / "a.las", WHOLE)
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ValueError, match=rf"a.las: needs the package {package} .* pip install 'spnr-jax\[formats\]'"):
-        read_cloud(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize(
