@@ -217,7 +217,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
         values = [piece[name] for name in names] if rows.dtype.names else piece.T
-        yield {name.lower(): column for name, column in zip(names, values, strict=True)}
+        named = zip(names, values, strict=True)
+        yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
