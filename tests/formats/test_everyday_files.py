@@ -85,12 +85,9 @@ RGB, OBJ_FACE = ("red", "green", "blue"), "f 1 2 3 4\n"
 PACKED = GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]
 CORNERS = [" ".join(map(str, corner)) for corner in SQUARE]
 COLORED_MESHES = {
-    "uchar": ("a.ply", square_ply("uchar", RGB, GREEN)),
     "ushort": ("a.ply", square_ply("ushort", RGB, [257 * c for c in GREEN])),
     "floats to 255": ("a.ply", square_ply("float", RGB, GREEN)),
-    "floats to 1": ("a.ply", square_ply("float", RGB, [c / 255 for c in GREEN])),
     "r g b": ("a.ply", square_ply("uchar", "rgb", GREEN)),
-    "diffuse": ("a.ply", square_ply("uchar", [f"diffuse_{name}" for name in RGB], GREEN)),
     "packed": ("a.ply", square_ply("uint", ["rgb"], [PACKED])),
     "COFF": ("a.off", "COFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OFF, colours of faces": ("a.off", "OFF\n4 1 0\n" + "\n".join(CORNERS) + "\n4 0 1 2 3 40 170 60\n"),
