@@ -65,6 +65,20 @@ def first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
+@contextlib.contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """UserError, what a file is and why, in place of whatever a library raises that stumbles over it."""
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:
+        if is_bug(error):
+            raise
+        reason = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
+        raise UserError(f"{what} ({reason})") from error
+
+
 def one_line(error: Exception) -> str:
     """An error message on one line of limited length; errors of the disk with the path."""
     said = str(error) or type(error).__name__

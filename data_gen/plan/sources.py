@@ -14,13 +14,20 @@ Amazon Berkeley Objects, the 3D download (abo-3dmodels.tar, unpacked); the produ
     3dmodels/original/L/B01N2PLWIL.glb    one product a file, sorted into folders by the id's last letter
 
 glTF is y up, metres.
+
+Of any other folder, every mesh file in it or below.
 """
 
+import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.meshes import SUFFIXES
+
+NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,3 +83,37 @@ def find_products(root: Path) -> list[Listed]:
             f"--root {root}: expected {FOLDER}/original/*/*.glb, as in the ABO 3D download; {describe_folder(root)}"
         )
     return [Listed(object_id=path.stem, path=path, folder=path.parent) for path in paths]
+
+
+def find_meshes(folder: Path) -> list[tuple[str, Path]]:
+    """(object id, file) of every mesh file below a folder, sorted by id; ids are unique and safe as folder names.
+
+    An id is the file's name without suffix, or the folder's name where a .gltf or .obj is alone in a subfolder; names
+    that collide become the whole path. Hidden files and folders are skipped.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder: give a folder of {' '.join(SUFFIXES)} files")
+    relative = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    visible = [p for p in relative if (folder / p).is_file() and not any(part.startswith(".") for part in p.parts)]
+    if not visible:
+        raise UserError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
+    siblings = Counter(path.parent for path in visible)
+    names = []
+    for path in visible:
+        alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
+        names.append(_safe(path.parent.name if alone else path.stem))
+    shared = Counter(name.casefold() for name in names)
+    ids: dict[str, tuple[str, Path]] = {}
+    for name, path in zip(names, visible, strict=True):
+        unique = wanted = name if shared[name.casefold()] == 1 else _safe("_".join(path.parts))
+        number = 2
+        while unique.casefold() in ids or (unique != name and unique.casefold() in shared):
+            unique, number = f"{wanted}-{number}", number + 1
+        ids[unique.casefold()] = unique, folder / path
+    return sorted(ids.values())
+
+
+def _safe(name: str) -> str:
+    """A name of letters, digits, dot, dash and underscore that is no hidden folder."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "object"

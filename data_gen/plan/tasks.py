@@ -25,7 +25,6 @@ from data_gen import procedural
 from data_gen.plan import sources
 from data_gen.plan.sources import Category
 from spnr_jax.errors import UserError, require_at_least
-from spnr_jax.formats import meshes
 from spnr_jax.formats.surface_points import Spread
 
 DEFAULT_OBJECTS = 200
@@ -224,7 +223,7 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
     """The objects of the source that are files, in any order."""
     source, category = source_of(config)
     if source == "meshes":
-        found = meshes.find_meshes(root)
+        found = sources.find_meshes(root)
         return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
     listed = sources.find_objects(root, category) if category else sources.find_products(root)
     return [Task(**vars(x), category=category or "", shown_path=show_path(x.path, root)) for x in listed]

@@ -38,11 +38,13 @@ from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
+from scipy.ndimage import map_coordinates
 
-from spnr_jax.errors import UserError, is_bug
-from spnr_jax.formats.columns import srgb_to_linear
+from spnr_jax.errors import UserError, refusing
+from spnr_jax.formats.columns import Columns, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
+MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
 Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
 ShownParts = Literal["opaque", "skip"]
 # What becomes of parts that light passes through: refuse the object, as references need, draw them as if they were
@@ -56,10 +58,6 @@ MOST_NAMES, LONGEST_NAME = 3, 40  # in a sentence
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
-# what readers of images raise on those that break their rules
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (OSError, SyntaxError, ValueError, LookupError, RuntimeError, AttributeError)
-UNREADABLE += (Image.DecompressionBombError, Image.DecompressionBombWarning)
 LEVELS = np.arange(256) / 255  # of 8 bits
 SRGB_TABLE, DIRECTION_TABLE = srgb_to_linear(LEVELS).astype(np.float32), (2 * LEVELS - 1).astype(np.float32)
 
@@ -126,7 +124,8 @@ class Part:
 class Asset:
     """One object: its parts, what kind it is, and what its source holds that is not modelled (named, never silent).
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing.
+    `notes` are sentences about what was made of transparent parts and of files that are missing; `points` the columns
+    of the vertices of a file without faces.
     """
 
     parts: tuple[Part, ...]
@@ -134,6 +133,7 @@ class Asset:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     source: dict = field(default_factory=dict)
+    points: Columns | None = None
 
 
 def make_material(
@@ -276,31 +276,28 @@ class Tolerance:
 
 
 def read_image(data: bytes, name: str) -> np.ndarray:
-    """The texels of `decode_image`; RejectedAsset, which names it, for an image that cannot be read."""
-    try:
+    """The texels of `decode_image`; ValueError, which names it, for an image that cannot be read."""
+    with refusing(f"names an image that cannot be read: {name}"):
         return decode_image(data)
-    except UserError as error:
-        raise RejectedAsset(f"names an image that cannot be read: {name} ({error})") from None
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none."""
+    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none.
+
+    ValueError for none, and for too large a one; what is damaged raises whatever Pillow raises.
+    """
     if data.startswith(KTX2):
-        raise UserError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
+        raise ValueError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
     try:
         with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
             image: Image.Image = Image.open(io.BytesIO(data))
-        if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
-            raise UserError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-        if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
-            image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
-        return np.asarray(image.convert("RGBA"))
     except UnidentifiedImageError:
-        raise UserError("is not an image") from None
-    except UNREADABLE as error:
-        if is_bug(error):
-            raise
-        raise UserError(str(error)) from None
+        raise ValueError("is not an image") from None
+    if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+        raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+    if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+        image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+    return np.asarray(image.convert("RGBA"))
 
 
 def color_texels(encoded: np.ndarray, table: np.ndarray = SRGB_TABLE) -> np.ndarray:
@@ -334,22 +331,8 @@ def resize(texels: np.ndarray, height: int | np.integer, width: int | np.integer
 
 def lookup(texels: np.ndarray, texcoords: np.ndarray, wrap: Wrap) -> np.ndarray:
     """Bilinear values (n,) or (n, c) of a texture (height, width) or (height, width, c) at texcoords (n, 2)."""
-    size = np.array([texels.shape[1], texels.shape[0]])
-    position = np.asarray(texcoords, np.float64) * size - 0.5
-    corner = np.floor(position).astype(np.int64)
-    weight = position - corner
-    (left, top), (right, bottom) = _wrap(corner, size, wrap).T, _wrap(corner + 1, size, wrap).T
-    x, y = (weight[:, axis].reshape(-1, *[1] * (texels.ndim - 2)) for axis in (0, 1))
-    upper = (1 - x) * texels[top, left] + x * texels[top, right]
-    lower = (1 - x) * texels[bottom, left] + x * texels[bottom, right]
-    return (1 - y) * upper + y * lower
-
-
-def _wrap(index: np.ndarray, size: np.ndarray, wrap: Wrap) -> np.ndarray:
-    """Texel indices inside [0, size) for any integer indices."""
-    if wrap == "clamp":
-        return np.clip(index, 0, size - 1)
-    if wrap == "repeat":
-        return index % size
-    folded = index % (2 * size)
-    return np.minimum(folded, 2 * size - 1 - folded)
+    height, width, *channels = texels.shape
+    places = (np.asarray(texcoords, np.float64) * [width, height] - 0.5)[:, ::-1].T
+    flat = np.moveaxis(texels.reshape(height, width, -1), -1, 0)
+    values = [map_coordinates(channel, places, np.float64, order=1, mode=MODES[wrap]) for channel in flat]
+    return np.stack(values, axis=-1).reshape(-1, *channels)

@@ -26,6 +26,7 @@ from spnr_jax.formats.assets import Asset, ShownParts
 from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
+from spnr_jax.formats.surface_points import bounding_box, sample_surface
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, clean_columns
 from spnr_jax.kernels.cloud_arrays import (
@@ -75,30 +76,22 @@ class PlacedCloud:
 class Reading:
     """How a file is read; ValueError for an option that there is not."""
 
-    num_points: int | None = None
-    """More points are thinned out evenly, fewer are kept; a mesh gives exactly so many, or 4096."""
-    up: str = "auto"
-    """The file's upward axis, or "auto"."""
+    num_points: int | None = None  # more points are thinned out evenly, fewer are kept; a mesh gives as many, or 4096
+    up: str = "auto"  # the file's upward axis
     seed: int = 0
-    clean: Clean = "off"
-    """How points, never those of meshes, are cleaned before they are thinned (spnr_jax/kernels/cleaning.py)."""
-    cut: Cut = WHOLE
-    """Which part of a scene is wanted."""
-    transparent_parts: ShownParts = "opaque"
-    """Transparent parts of a mesh are taken as opaque, or left out ("skip")."""
-    report: Report = lambda line: None
-    """Gets a line about every assumption."""
+    clean: Clean = "off"  # how points, never those of meshes, are cleaned before they are thinned (kernels/cleaning.py)
+    cut: Cut = WHOLE  # which part of a scene is wanted
+    transparent_parts: ShownParts = "opaque"  # of a mesh; or left out ("skip")
+    report: Report = lambda line: None  # gets a line about every assumption
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        if self.up not in (*ROTATIONS, "auto"):
-            raise UserError(f"up must be one of {', '.join(ROTATIONS)}, auto, got {self.up!r}")
+        choices = {"up": (*ROTATIONS, "auto"), "transparent_parts": get_args(ShownParts), "clean": get_args(Clean)}
+        for name, known in choices.items():
+            if (value := getattr(self, name)) not in known:
+                raise UserError(f"{name} must be one of {', '.join(known)}, got {value!r}")
         if self.num_points is not None and self.num_points < 1:
             raise UserError(f"num_points must be at least 1, got {self.num_points}")
-        if self.transparent_parts not in get_args(ShownParts):
-            raise UserError(f"transparent_parts must be opaque or skip, got {self.transparent_parts!r}")
-        if self.clean not in get_args(Clean):
-            raise UserError(f"clean must be one of {', '.join(get_args(Clean))}, got {self.clean!r}")
 
 
 def read_cloud(
@@ -149,7 +142,12 @@ class Points(NamedTuple):
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
     pieces, noise = column_pieces(path, kind), 0.0
-    points = _sample_mesh(path, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
+    if pieces is None:
+        from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
+
+        asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
+        pieces = None if asset.points is None else iter([asset.points])
+    points = _sample_mesh(asset, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
     rows, lines = scenes.select_object(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
@@ -226,14 +224,10 @@ def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[n
     return positions + (before - origin), origin
 
 
-def _sample_mesh(path: Path, kind: str, how: Reading) -> Points:
+def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
-    from spnr_jax.formats.surface_points import bounding_box, sample_surface
-
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
     for line in ([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []) + list(asset.notes):
         report(line)
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)

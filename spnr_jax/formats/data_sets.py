@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import clouds
 from spnr_jax.formats.assets import decode_image
 from spnr_jax.formats.point_tables import read_arrays
@@ -138,7 +138,8 @@ def _lights(content: bytes, views: int) -> np.ndarray:
 
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
-    image = decode_image(content)
+    with refusing("is no picture"):
+        image = decode_image(content)
     if image.shape[:2] != (height, width):
         raise UserError(f"{image.shape[1]} x {image.shape[0]} pixels, transforms.json says {width} x {height}")
     return image

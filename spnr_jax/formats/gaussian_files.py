@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import SRGB, Columns
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.kernels.records import Gaussians
@@ -141,10 +141,8 @@ def spz_columns(path: Path) -> Columns:
     """The columns of a .spz file; ValueError for other versions than 2 and 3."""
     data = path.read_bytes()
     unpacker = zlib.decompressobj(wbits=31)
-    try:
+    with refusing("is a broken .spz file"):
         content = data if data[:4] == MAGIC else unpacker.decompress(data, MOST_BYTES)
-    except zlib.error as error:
-        raise UserError(f"is a broken .spz file ({error})") from None
     if content[:4] != MAGIC or len(content) < 16:
         raise UserError("is not an .spz file, or its header is cut off")
     version, count = struct.unpack_from("<II", content, 4)

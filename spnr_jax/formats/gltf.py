@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset, Tolerance, TransparentParts
-from spnr_jax.formats.columns import LINEAR, SRGB
+from spnr_jax.formats.columns import LINEAR, Columns
 from spnr_jax.formats.gltf_file import (
     BASIS,
     DRACO,
@@ -25,8 +25,6 @@ from spnr_jax.formats.gltf_file import (
     decode_mesh,
     read_material,
 )
-from spnr_jax.formats.polygons import strip_faces
-from spnr_jax.surfels.gaussians import C0
 
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_lights_punctual"}
@@ -95,7 +93,9 @@ class Shape(NamedTuple):
 def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Asset:
     """The scene's triangles with their materials, as they lie in the file; RejectedAsset if it cannot be used."""
     file, tolerance = GltfFile(path), Tolerance(transparent_parts)
-    document = file.document
+    document, drawn = file.document, list(list_primitives(file))
+    if not tolerance.strict and (points := _points(file, drawn)):
+        return Asset(parts=(), points=points)
     for extension in document.get("extensionsRequired", []):
         if extension not in READABLE and not extension.startswith("KHR_materials_"):
             raise RejectedAsset(f"needs {extension}, which cannot be read: export it without that extension")
@@ -105,7 +105,7 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     materials: dict[int | None, GltfMaterial] = {}
     shapes: dict[int, Shape] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
-    for primitive, matrix in list_primitives(file):
+    for primitive, matrix in drawn:
         mode = MODES[primitive.get("mode", 4)]
         if not mode.startswith("TRIANGLE"):
             ignored.add(f"{mode} primitives")
@@ -130,41 +130,24 @@ def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Ass
     return tolerance.asset(parts)
 
 
-def gltf_points(path: Path) -> dict[str, np.ndarray] | None:
-    """The columns of the points of a scene without triangles; None if it has some, or no points either.
-
-    Colours are linear, as the specification has them, or display-referred sRGB where a splat says so.
-    """
-    file = GltfFile(path)
-    drawn = list(list_primitives(file))
+def _points(file: GltfFile, drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
+    """The columns of the points of a scene without triangles; None if it has some, or no points either."""
     modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
-    pieces = []
+    pieces: list[Columns] = []
     for primitive, matrix in drawn:
-        if primitive.get("mode") == 0:
-            columns = _point_columns(file, primitive)
-            placed = np.stack([columns[axis] for axis in "xyz"], axis=-1) @ matrix[:3, :3].T + matrix[:3, 3]
-            pieces.append(columns | dict(zip("xyz", placed.T, strict=True)))
+        if primitive.get("mode") != 0:
+            continue
+        if SPLATS in primitive.get("extensions", {}):
+            raise RejectedAsset(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
+        attributes = primitive["attributes"]
+        positions = file.accessor(attributes["POSITION"]) @ matrix[:3, :3].T + matrix[:3, 3]
+        pieces.append(dict(zip("xyz", positions.T, strict=True)))
+        if "COLOR_0" in attributes:
+            pieces[-1] |= dict(zip((*LINEAR, "alpha"), file.accessor(attributes["COLOR_0"]).T, strict=False))
     shared = set(pieces[0]).intersection(*pieces[1:])
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0] if name in shared}
-
-
-def _point_columns(file: GltfFile, primitive: dict) -> dict[str, np.ndarray]:
-    """The columns of a primitive of points in its own frame, without normals, which nodes turn."""
-    attributes = primitive["attributes"]
-    columns = dict(zip("xyz", file.accessor(attributes["POSITION"]).T, strict=True))
-    shown = primitive.get("extensions", {}).get(SPLATS, {}).get("colorSpace") == "srgb_rec709_display"
-    names = (*(SRGB if shown else LINEAR), "alpha")
-    if "COLOR_0" in attributes:
-        columns |= dict(zip(names, file.accessor(attributes["COLOR_0"]).T, strict=False))
-    elif f"{SPLATS}:SH_DEGREE_0_COEF_0" in attributes:
-        colors = 0.5 + C0 * file.accessor(attributes[f"{SPLATS}:SH_DEGREE_0_COEF_0"])
-        columns |= dict(zip(names, np.clip(colors, 0, 1).T, strict=False))
-    if f"{SPLATS}:OPACITY" in attributes:
-        columns.pop("alpha", None)
-        columns["splat_opacity"] = file.accessor(attributes[f"{SPLATS}:OPACITY"])[:, 0]
-    return columns
 
 
 def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:
@@ -218,4 +201,6 @@ def _triangles(order: np.ndarray, mode: str) -> np.ndarray:
         return np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_FAN":
         return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)
-    return strip_faces(order)
+    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other one of a strip is turned
+    return faces

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from spnr_jax.errors import refusing
 from spnr_jax.formats.assets import (
     DIRECTION_TABLE,
     Alpha,
@@ -151,13 +152,11 @@ def unpack(data: memoryview, packed: dict) -> bytes:
     """The bytes of a buffer view that meshopt packed, as its extension describes them."""
     meshopt = extra("meshoptimizer")
     mode, count, stride, kind = packed["mode"], packed["count"], packed["byteStride"], packed.get("filter", "NONE")
-    try:
+    with refusing("holds meshopt data that is broken or cut off"):
         if mode != "ATTRIBUTES":
             decode = {"TRIANGLES": meshopt.decode_index_buffer, "INDICES": meshopt.decode_index_sequence}[mode]
             return decode(count, 4, data).astype({2: "<u2", 4: "<u4"}[stride]).tobytes()
         elements = meshopt.decode_vertex_buffer(count, stride, data, np.dtype((np.void, stride)))
-    except (RuntimeError, ValueError) as error:
-        raise RejectedAsset(f"holds meshopt data that is broken or cut off ({error})") from None
     if kind == "NONE":
         return elements.tobytes()
     function, strides = FILTERS.get(kind, ("", ()))

@@ -10,13 +10,14 @@ sizes are walked through before (LASzip specification, LAZ 1.4 R1):
     chunk table            u32 version, u32 number of chunks
 """
 
+import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from spnr_jax.errors import UserError, is_bug
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import extra
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
@@ -29,8 +30,6 @@ COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
 # places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
 SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
 COMPRESSED = 0xC0  # bits of the point format
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
 
 
 def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
@@ -39,15 +38,14 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     _check_header(path)
     try:
-        with laspy.open(path, laz_backend=backends, read_evlrs=False) as scan:
+        with (
+            refusing("is a broken or truncated LAS file"),
+            laspy.open(path, laz_backend=backends, read_evlrs=False) as scan,
+        ):
             present = set(scan.header.point_format.dimension_names)
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
                 yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
-    except (laspy.errors.LaspyException, *UNREADABLE) as error:
-        if is_bug(error):
-            raise
-        raise UserError(f"is a broken or truncated LAS file ({error})") from None
     except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
         if type(error).__name__ != "PanicException":
             raise
@@ -68,13 +66,14 @@ def _check_header(path: Path) -> None:
     if not header_size + records * RECORD_HEAD <= data <= size:
         raise UserError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
     if kind & COMPRESSED:
-        check_laz(np.memmap(path, np.uint8, "r"), header_size, records, data, length, count)
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            check_laz(content, header_size, records, data, length, count)
     elif not length or data + count * length > size:
         raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")
 
 
-def check_laz(content: np.ndarray, first_record: int, records: int, data: int, length: int, points: int) -> None:
-    """ValueError unless lazrs can be trusted with the bytes (n,) of a scan.
+def check_laz(content: mmap.mmap, first_record: int, records: int, data: int, length: int, points: int) -> None:
+    """ValueError unless lazrs can be trusted with the bytes of a scan.
 
     `records` stand from `first_record` on, `points`, of `length` bytes when unpacked, from `data` on.
     """
@@ -86,10 +85,12 @@ def check_laz(content: np.ndarray, first_record: int, records: int, data: int, l
             chunk_size = VARIABLE  # as writers of COPC put it
         if chunk_size != VARIABLE and not 0 < chunk_size <= LARGEST_CHUNK:
             raise UserError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
-        (table,) = _numbers(content, data, "<q")
+        (table,) = struct.unpack_from("<q", content, data)
         if table == -1:
-            (table,) = _numbers(content, len(content) - 8, "<q")
-        _, chunks = _numbers(content, table, "<II")
+            (table,) = struct.unpack_from("<q", content, len(content) - 8)
+        if table < 0:
+            raise UserError(f"its table of chunks lies at byte {table}")
+        _, chunks = struct.unpack_from("<II", content, table)
         if chunks * length > len(content):  # each begins with a point as it is
             raise UserError(f"{chunks} chunks in {len(content)} bytes")
         if chunks * (LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size) < points:
@@ -100,31 +101,24 @@ def check_laz(content: np.ndarray, first_record: int, records: int, data: int, l
         raise UserError("is cut off: its compressed data ends too early") from None
 
 
-def _items(content: np.ndarray, place: int, records: int) -> tuple[list[tuple[int, int]], int]:
+def _items(content: mmap.mmap, place: int, records: int) -> tuple[list[tuple[int, ...]], int]:
     """((type, size) of each item of a point, points in a chunk) as LASzip's record says."""
     for _ in range(records):
-        name, number, size = _numbers(content, place + 2, "<16sHH")
+        name, number, size = struct.unpack_from("<16sHH", content, place + 2)
         if name.rstrip(b"\0") == NAME and number == NUMBER:
             start = place + RECORD_HEAD
-            (count,) = _numbers(content, start + ITEMS_AT, "<H")
-            (chunk_size,) = _numbers(content, start + CHUNK_SIZE_AT, "<I")
-            found = [_numbers(content, start + ITEMS_AT + 2 + 6 * i, "<HH") for i in range(count)]
-            return [(int(kind), int(wide)) for kind, wide in found], int(chunk_size)
+            (count,) = struct.unpack_from("<H", content, start + ITEMS_AT)
+            (chunk_size,) = struct.unpack_from("<I", content, start + CHUNK_SIZE_AT)
+            places = range(start + ITEMS_AT + 2, start + ITEMS_AT + 2 + 6 * count, 6)
+            return [struct.unpack_from("<HH", content, at) for at in places], chunk_size
         place += RECORD_HEAD + size
     raise UserError("has no record that says how its points are compressed")
 
 
-def _walk(content: np.ndarray, place: int, chunks: int, length: int, layers: int) -> None:
+def _walk(content: mmap.mmap, place: int, chunks: int, length: int, layers: int) -> None:
     """ValueError unless all layers of all chunks end inside the file."""
     for _ in range(chunks):
-        count, *sizes = _numbers(content, place + length, f"<{1 + layers}I")
+        count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
         if place > len(content) or count > LARGEST_CHUNK:
             raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
-
-
-def _numbers(content: np.ndarray, place: int, form: str) -> tuple:
-    """Numbers of the bytes from a place on; struct.error where there are too few."""
-    if not 0 <= place <= len(content):
-        raise struct.error
-    return struct.unpack(form, content[place : place + struct.calcsize(form)].tobytes())

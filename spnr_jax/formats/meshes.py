@@ -1,4 +1,4 @@
-"""Mesh files as assets: which files a folder holds, and one of them read, checked, cleaned and merged by material.
+"""Mesh files as assets: read, checked, cleaned and merged by material.
 
 glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (polygons.py)
 have vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
@@ -13,10 +13,7 @@ Every reason not to use a file is a RejectedAsset with one line.
 
 import contextlib
 import hashlib
-import re
-import struct
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from spnr_jax.errors import UserError, first_line, is_bug
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import (
     Asset,
     Material,
@@ -34,9 +31,9 @@ from spnr_jax.formats.assets import (
     make_material,
 )
 from spnr_jax.formats.columns import full_scale
-from spnr_jax.formats.gltf import gltf_points, load_gltf
-from spnr_jax.formats.obj import load_obj, obj_points
-from spnr_jax.formats.polygons import PLAIN, off_points
+from spnr_jax.formats.gltf import load_gltf
+from spnr_jax.formats.obj import load_obj
+from spnr_jax.formats.polygons import PLAIN
 from spnr_jax.formats.surface_points import bounding_box, face_areas, face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
@@ -45,11 +42,6 @@ ACROSS = 0.5  # median cosine between normals and faces, below which the normals
 MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
 WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
 SUFFIXES = (".glb", ".gltf", ".obj", *PLAIN)
-NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
-# What readers raise on files that break their rules; not MemoryError and not an interrupt.
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, OSError, RuntimeError)
-UNREADABLE += (AssertionError, struct.error, DeprecationWarning)
 
 
 def assemble(asset: Asset, strict: bool) -> Asset:
@@ -90,11 +82,10 @@ def _finite(asset: Asset) -> Asset:
 
 def _without_false_normals(asset: Asset) -> Asset:
     """The asset without normals where most lie across their faces, as those of other axes do."""
-    shaded = [part for part in asset.parts if part.normals is not None]
+    shaded = [part for part in asset.parts if part.normals is not None and len(part.faces)]
     means = [unit(part.normals[part.faces].sum(axis=1)) for part in shaded if part.normals is not None]
-    cosines = [
-        np.abs(np.sum(mean * unit(face_crosses(part)), axis=-1)) for mean, part in zip(means, shaded, strict=True)
-    ]
+    flat = [unit(face_crosses(part.positions, part.faces)) for part in shaded]
+    cosines = [np.abs(np.sum(mean * normals, axis=-1)) for mean, normals in zip(means, flat, strict=True)]
     if not cosines or not np.median(np.concatenate(cosines)) < ACROSS:
         return asset
     note = "normals of the file left out: they lie across its faces"
@@ -196,35 +187,6 @@ def _merge(parts: list[Part]) -> Part:
     return replace(parts[0], faces=np.concatenate(faces), **whole)
 
 
-def find_meshes(folder: Path) -> list[tuple[str, Path]]:
-    """(object id, file) of every mesh file below a folder, sorted by id; ids are unique and safe as folder names.
-
-    An id is the file's name without suffix, or the folder's name where a .gltf or .obj is alone in a subfolder; names
-    that collide become the whole path. Hidden files and folders are skipped.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder: give a folder of {' '.join(SUFFIXES)} files")
-    relative = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    visible = [p for p in relative if (folder / p).is_file() and not any(part.startswith(".") for part in p.parts)]
-    if not visible:
-        raise UserError(f"{folder} holds no mesh file: expected {' '.join(SUFFIXES)}, in it or in its subfolders")
-    siblings = Counter(path.parent for path in visible)
-    names = []
-    for path in visible:
-        alone = siblings[path.parent] == 1 and path.suffix.lower() in NAMED_BY_FOLDER and path.parent.name
-        names.append(_safe(path.parent.name if alone else path.stem))
-    shared = Counter(name.casefold() for name in names)
-    ids: dict[str, tuple[str, Path]] = {}
-    for name, path in zip(names, visible, strict=True):
-        unique = wanted = name if shared[name.casefold()] == 1 else _safe("_".join(path.parts))
-        number = 2
-        while unique.casefold() in ids or (unique != name and unique.casefold() in shared):
-            unique, number = f"{wanted}-{number}", number + 1
-        ids[unique.casefold()] = unique, folder / path
-    return sorted(ids.values())
-
-
 def load_mesh(
     path: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse", kind: str | None = None
 ) -> Asset:
@@ -248,36 +210,24 @@ def load_mesh(
             asset = PLAIN[kind](path.read_bytes())
         else:
             raise RejectedAsset(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
-        asset = assemble(asset, transparent_parts == "refuse")
+        strict = transparent_parts == "refuse"
+        asset = asset if asset.points and not strict else assemble(asset, strict)
     return replace(asset, source={"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
-
-
-def points_of(path: Path, kind: str) -> dict[str, np.ndarray] | None:
-    """The columns of the points of a mesh file that has no faces, for pictures; None where it has some."""
-    readers = {".obj": obj_points, ".off": off_points, ".glb": gltf_points, ".gltf": gltf_points}
-    with _refusing():
-        return readers[kind](path) if kind in readers else None
 
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
     """RejectedAsset, meanwhile, where libraries stumble over a file."""
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):  # assemble looks for what is not finite
+        with (
+            refusing("cannot be read, the file is broken or truncated"),
+            warnings.catch_warnings(),
+            np.errstate(all="ignore"),  # assemble looks for what is not finite
+        ):
             # numpy only warns where the text of a file stops being numbers
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
             yield
     except RejectedAsset:
         raise
-    except UserError as error:  # colours that are none, say
+    except UserError as error:
         raise RejectedAsset(str(error)) from error
-    except UNREADABLE as error:
-        if is_bug(error):
-            raise
-        text = f"there is no {error}" if isinstance(error, KeyError) else first_line(error)
-        raise RejectedAsset(f"cannot be read, the file is broken or truncated ({text})") from error
-
-
-def _safe(name: str) -> str:
-    """A name of letters, digits, dot, dash and underscore that is no hidden folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "object"

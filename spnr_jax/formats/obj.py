@@ -67,12 +67,14 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     """
     read, tolerance = partial(read_companion, path.parent, root=root), Tolerance(transparent_parts)
     text = _parse(path)
+    columns = _columns(text)
+    if not (text.sizes or text.rows["v"]):
+        raise RejectedAsset("has no faces, and no vertices")
     if not text.sizes:
-        raise RejectedAsset("has no faces")
+        return Asset(parts=(), points=columns)
     library: Library = {}
     for names in text.libraries:
         library |= parse_mtl(_read_library(read, path.parent, names, tolerance))
-    columns = _columns(text)
     colors, notes = colors_of(columns) or (None, [])
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text.used):
@@ -83,19 +85,6 @@ def load_obj(path: Path, root: Path | None = None, transparent_parts: Transparen
     if text.rows["vn"] and any(part.normals is None for part in parts):
         tolerance.ignored.add("normals that only some faces have (flat shading is used)")
     return tolerance.asset(_without_doubles(parts, tolerance) if parts else [], *notes)
-
-
-def obj_points(path: Path) -> Columns | None:
-    """The columns of the vertices of a file without faces; None if it has some."""
-    if re.search(rb"(^|[\r\n])[ \t]*f[ \t]", path.read_bytes()):
-        return None
-    text = _parse(path)
-    if not text.rows["v"]:
-        raise RejectedAsset("has no faces, and no vertices")
-    columns, normals = _columns(text), text.rows["vn"]
-    if len(normals) == len(columns["x"]):
-        columns |= dict(zip(NORMAL, _table(normals, 3).T, strict=True))
-    return columns
 
 
 def _parse(path: Path) -> Text:
@@ -130,12 +119,15 @@ def _table(rows: list[str], width: int) -> np.ndarray:
 
 
 def _columns(text: Text) -> Columns:
-    """The columns of the vertices: positions, and colours where every row has them."""
+    """The columns of the vertices: positions, colours where every row has them, normals where no face does."""
     try:
         table = np.loadtxt(text.rows["v"] or ["0 0 0"], ndmin=2, comments="#")
     except ValueError:  # rows of different lengths
         table = _table(text.rows["v"], 3)
-    return dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    if not text.sizes and len(text.rows["vn"]) == len(table):
+        columns |= dict(zip(NORMAL, _table(text.rows["vn"], 3).T, strict=True))
+    return columns
 
 
 def _parts(text: Text, columns: Columns, colors: np.ndarray | None, looks: dict[str, Material | None]) -> list[Part]:

@@ -24,7 +24,7 @@ from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.point_tables import numpy_pieces, text_pieces
-from spnr_jax.formats.row_files import element_pieces, join_pieces, pcd_pieces, read_ply_header
+from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_elements, read_ply_header
 
 READERS = {
     ".ply": lambda path: _ply(path),
@@ -116,33 +116,28 @@ def _version(head: bytes, form: str | None) -> str:
 
 
 def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:
-    """The columns of a file of points, some points at a time; None where it has faces; `kind` as kind_of says."""
+    """The columns of a file of points, some points at a time; None for a mesh; `kind` as kind_of says."""
     kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
-            if read_ply_header(file).faces:
+            if read_ply_header(file).has_faces:
                 return None
-    if kind in READERS:
-        return READERS[kind](path)
-    from spnr_jax.formats.meshes import points_of  # here: points are read without the readers of meshes
-
-    columns = points_of(path, kind)
-    return None if columns is None else iter([columns])
+    return READERS[kind](path) if kind in READERS else None
 
 
 def parse_ply(content: bytes) -> Columns:
     """The columns of the vertices in the bytes of a PLY file."""
-    return join_pieces(element_pieces(io.BytesIO(content)))
+    file = io.BytesIO(content)
+    return read_elements(file, read_ply_header(file), "vertex")["vertex"][0]
 
 
 def _ply(path: Path) -> Iterator[Columns]:
     """The columns of a .ply file, unpacked where it is one of compressed splats."""
     with path.open("rb") as file:
-        elements = {name: [field for field, _ in fields] for name, _, fields in read_ply_header(file).elements}
-        file.seek(0)
-        if list(elements)[:2] != ["chunk", "vertex"] or "packed_position" not in elements["vertex"]:
-            yield from element_pieces(file)
-            return
-        chunks = join_pieces(element_pieces(file, "chunk"))
-        file.seek(0)
-        yield decompress_columns(chunks, join_pieces(element_pieces(file)))
+        header = read_ply_header(file)
+        fields = {name: {field for field, _ in properties} for name, _, properties in header.elements}
+        if list(fields)[:2] == ["chunk", "vertex"] and "packed_position" in fields["vertex"]:
+            (chunks, _), (packed, _) = read_elements(file, header, "chunk", "vertex").values()
+            yield decompress_columns(chunks, packed)
+        else:
+            yield from (columns for _, columns, _ in element_pieces(file, header, "vertex"))

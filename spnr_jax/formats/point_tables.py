@@ -17,13 +17,9 @@ of text also in which line; its name is added by the caller.
 
 import contextlib
 import io
-import math
 import re
 import threading
-import tokenize
 import warnings
-import zipfile
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -31,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import Columns
 
 # --- text -------------------------------------------------------------------------------------------------------------
@@ -191,10 +187,6 @@ def _are_normals(vectors: np.ndarray) -> bool:
 HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
 PIECE_BYTES = 2**25  # of an array in memory at a time
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
-# what NumPy and zipfile raise on files that break their rules
-UNREADABLE: tuple[type[Exception], ...]
-UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, RuntimeError, SyntaxError)
-UNREADABLE += (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 ARRAY_COLUMNS = {
     **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
@@ -215,11 +207,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
-    try:
-        with _parsing():
-            loaded = np.lib.format.open_memmap(path, mode="r")
-    except UNREADABLE as error:
-        raise UserError(f"is a broken, truncated or pickled NumPy file ({error})") from None
+    with refusing("is a broken, truncated or pickled NumPy file"), _parsing():
+        loaded = np.lib.format.open_memmap(path, mode="r")
     rows = np.atleast_1d(loaded)
     if rows.ndim == 3:  # the pixels of a picture
         rows = rows.reshape(-1, rows.shape[2])
@@ -228,7 +217,8 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
         values = [piece[name] for name in names] if rows.dtype.names else piece.T
-        yield {name.lower(): column for name, column in zip(names, values, strict=True)}
+        named = zip(names, values, strict=True)
+        yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
@@ -240,26 +230,18 @@ def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> b
 
 
 def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive, those whose names are wanted; ValueError if it is broken or unpacks to too much.
-
-    An array's size is checked before memory is taken for it: its header must not announce more than its bytes.
-    """
-    arrays = {}
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            names = [name for name in members if wanted is None or name in wanted]
-            unpacked = sum(members[name].file_size for name in names)
-            if unpacked > MOST_BYTES:
-                raise UserError(
-                    f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces"
-                )
-            for name in names:
-                arrays[name] = _member(archive, members[name])
-    except UNREADABLE as error:
-        raise UserError(f"is a broken or truncated NumPy file ({error})") from None
+    """The arrays of an .npz archive, those that are wanted; ValueError if it is broken or unpacks to too much."""
+    with refusing("is a broken or truncated NumPy file"), _parsing(), np.load(file, allow_pickle=False) as archive:
+        names = [name for name in archive.files if wanted is None or name in wanted]
+        sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
+        if (unpacked := sum(sizes[name] for name in names)) > MOST_BYTES:
+            raise UserError(f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces")
+        try:
+            arrays = {name: np.asarray(archive[name]) for name in names}
+        except MemoryError:  # a header can announce any number
+            raise UserError("announces more than fits into the memory") from None
     if not arrays:
-        raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(members) or 'none'}")
+        raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(sizes) or 'none'}")
     return arrays
 
 
@@ -269,20 +251,6 @@ def _parsing() -> Iterator[None]:
     with HEADERS, warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
         yield
-
-
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One array of an archive."""
-    with _parsing(), archive.open(info) as stream:
-        version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
-        if dtype.hasobject or any(size < 0 for size in shape):
-            raise UserError(f"{info.filename} holds objects or a negative size, shape {shape} and type {dtype}")
-        if math.prod(shape) * dtype.itemsize > info.file_size:
-            raise UserError(f"{info.filename} is cut off: shape {shape} of {dtype} in {info.file_size} bytes")
-    with _parsing(), archive.open(info) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _name_columns(archive: dict[str, np.ndarray]) -> Columns:

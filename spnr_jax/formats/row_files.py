@@ -14,7 +14,6 @@ import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from io import BufferedIOBase
 from itertools import islice
 from pathlib import Path
@@ -42,7 +41,6 @@ TYPES = {
 }
 BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_HEADER_LIMIT = 2**20  # bytes
-FACES = ("face", "tristrips")  # elements that make a PLY a mesh
 LONGEST_LIST = 2**20  # items
 
 
@@ -53,9 +51,9 @@ class PlyHeader(NamedTuple):
     elements: list[Element]  # in the order of the file
 
     @property
-    def faces(self) -> str | None:
-        """The element of faces that make it a mesh."""
-        return next((name for name, count, _ in self.elements if name in FACES and count), None)
+    def has_faces(self) -> bool:
+        """Whether it is a mesh."""
+        return any(name == "face" and count for name, count, _ in self.elements)
 
 
 def read_ply_header(file: BufferedIOBase) -> PlyHeader:
@@ -88,17 +86,29 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     return PlyHeader(byte_order, elements)
 
 
-def element_pieces(file: BufferedIOBase, wanted: str = "vertex") -> Iterator[Columns]:
-    """The columns of an element of an open PLY file, some rows at a time; elements before it are skipped."""
-    return (columns for columns, _ in _pieces(file, wanted))
+def element_pieces(file: BufferedIOBase, header: PlyHeader, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
+    """(name, columns, lists) of elements of a PLY file that is at its data, in its order, some rows at a time."""
+    left = list(wanted)
+    for name, count, properties in header.elements:
+        for columns, lists in _element_rows(file, count, properties, header.byte_order):
+            if name in left:
+                yield name, {field.lower(): column for field, column in columns.items()}, lists
+        left = [other for other in left if other != name]
+        if not left:
+            return
+    names = ", ".join(name for name, _, _ in header.elements)
+    raise UserError(f"has no PLY element {left[0]!r}, only {names or 'none'}")
 
 
-def read_lists(file: BufferedIOBase, wanted: str) -> tuple[Columns, Lists]:
-    """All columns and lists of an element of an open PLY file."""
-    pieces = list(_pieces(file, wanted))
-    lists = {name: [found[name] for _, found in pieces] for name in pieces[0][1]}
-    joined = {name: tuple(map(np.concatenate, zip(*parts, strict=True))) for name, parts in lists.items()}
-    return join_pieces(columns for columns, _ in pieces), joined
+def read_elements(file: BufferedIOBase, header: PlyHeader, *wanted: str) -> dict[str, tuple[Columns, Lists]]:
+    """All columns and lists of elements of a PLY file that is at its data."""
+    pieces, found = list(element_pieces(file, header, *wanted)), {}
+    for name in wanted:
+        own = [(columns, lists) for element, columns, lists in pieces if element == name]
+        parts = {key: [lists[key] for _, lists in own] for key in own[0][1]}
+        joined = {key: tuple(map(np.concatenate, zip(*arrays, strict=True))) for key, arrays in parts.items()}
+        found[name] = join_pieces(columns for columns, _ in own), joined
+    return found
 
 
 def join_pieces(pieces: Iterable[Columns]) -> Columns:
@@ -109,38 +119,19 @@ def join_pieces(pieces: Iterable[Columns]) -> Columns:
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _pieces(file: BufferedIOBase, wanted: str) -> Iterator[tuple[Columns, Lists]]:
-    """The columns and lists of an element, some rows at a time."""
-    header = read_ply_header(file)
-    for name, count, properties in header.elements:
-        rows = _element_rows(file, count, properties, header.byte_order)
-        if name == wanted:
-            yield from (({field.lower(): column for field, column in columns.items()}, x) for columns, x in rows)
-            return
-        for _ in rows:
-            pass
-    names = ", ".join(name for name, _, _ in header.elements)
-    raise UserError(f"has no PLY element {wanted!r}, only {names or 'none'}")
-
-
 def _element_rows(
     file: BufferedIOBase, count: int, properties: Properties, order: str | None
 ) -> Iterator[tuple[Columns, Lists]]:
     """The columns and lists of the next element, some rows at a time; the file is left behind them."""
     if all(isinstance(kind, str) for _, kind in properties):
         layout = np.dtype([(field, (order or "=") + str(kind)) for field, kind in properties])
-        pieces = binary_rows(file, count, layout) if order else text_rows(_lines(file), count, layout)
+        pieces = read_rows(file, count, layout, text=order is None)
         yield from (({field: piece[field] for field in layout.names or ()}, {}) for piece in pieces)
         return
     done = 0
     while done < max(count, 1):
-        place, most = file.tell(), min(PIECE_LINES, count - done)
-        _, first = _any_rows(file, min(most, 1), properties, order, done)
-        file.seek(place)
-        piece = _equal_rows(file, most, properties, order, first)
-        if piece is None:
-            file.seek(place)
-            piece = _any_rows(file, most, properties, order, done)
+        most = min(PIECE_LINES, count - done)
+        piece = _equal_rows(file, most, properties, order, done) or _any_rows(file, most, properties, order, done)
         yield piece
         done += max(1, len(next(iter(piece[1].values()))[0]))
 
@@ -151,9 +142,12 @@ def _lines(file: BufferedIOBase) -> Iterator[str]:
 
 
 def _equal_rows(
-    file: BufferedIOBase, count: int, properties: Properties, order: str | None, first: Lists
+    file: BufferedIOBase, count: int, properties: Properties, order: str | None, before: int
 ) -> tuple[Columns, Lists] | None:
-    """At most `count` rows at once, whose lists have the lengths of the first; None where some have others."""
+    """At most `count` rows at once, whose lists have the lengths of the first; None, and no step, where some differ."""
+    place = file.tell()
+    _, first = _any_rows(file, min(count, 1), properties, order, before)
+    file.seek(place)
     fields: list[tuple] = []
     for name, kind in properties:
         if isinstance(kind, str):
@@ -169,9 +163,10 @@ def _equal_rows(
         else:
             rows = np.loadtxt(list(islice(_lines(file), count)), dtype=layout, comments=None, ndmin=1)
     except ValueError:
-        return None
+        rows = np.empty(0, layout)
     lists: Lists = {name: (rows[f"{name} length"].astype(np.int64), rows[name].ravel()) for name in first}
     if len(rows) < count or any((sizes != first[name][0]).any() for name, (sizes, _) in lists.items()):
+        file.seek(place)
         return None
     return {name: rows[name] for name, _ in properties if name not in first}, lists
 
@@ -217,10 +212,11 @@ def _take(
 
 def camera_row(file: BufferedIOBase) -> dict[str, float]:
     """The numbers of the camera that an open PLY file begins with, by their names; none if it begins with another."""
-    if [name for name, _, _ in read_ply_header(file).elements][:1] != ["camera"]:
+    header = read_ply_header(file)
+    if [name for name, _, _ in header.elements][:1] != ["camera"]:
         return {}
-    file.seek(0)
-    return {name: float(column[0]) for name, column in next(element_pieces(file, "camera")).items() if len(column)}
+    _, columns, _ = next(element_pieces(file, header, "camera"))
+    return {name: float(column[0]) for name, column in columns.items() if len(column)}
 
 
 # --- PCD --------------------------------------------------------------------------------------------------------------
@@ -234,8 +230,7 @@ KINDS = {"F": "f", "I": "i", "U": "u"}
 LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, less one; the others copy earlier ones
 
 
-@dataclass(frozen=True, kw_only=True)
-class PcdHeader:
+class PcdHeader(NamedTuple):
     """What a PCD file announces: the layout of a point, how many there are, and how and where they are written."""
 
     layout: np.dtype
@@ -257,12 +252,10 @@ def pcd_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     with path.open("rb") as file:
         header = _header(file.read(PCD_HEADER_LIMIT))
         file.seek(header.size)
-        if header.encoding == "ascii":
-            pieces = text_rows(_lines(file), header.num_points, header.layout)
-        elif header.encoding == "binary":
-            pieces = binary_rows(file, header.num_points, header.layout)
-        else:
+        if header.encoding == "binary_compressed":
             pieces = iter([_columns(file.read(), header)])
+        else:
+            pieces = read_rows(file, header.num_points, header.layout, text=header.encoding == "ascii")
         for points in pieces:
             yield {name.lower(): points[name] for name in points.dtype.names or () if points[name].ndim == 1}
 
@@ -367,34 +360,18 @@ def decompress(data: bytes, size: int) -> bytes:
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def text_rows(lines: Iterator[str], count: int, layout: np.dtype) -> Iterator[np.ndarray]:
-    """`count` records from as many lines of text, some at a time."""
-    found = 0
-    while found < count:
-        rows = list(islice(lines, min(PIECE_LINES, count - found)))
-        found += len(rows)
-        if not rows or (len(rows) < PIECE_LINES and found < count):
-            raise UserError(f"is cut off: its header announces {count} points, the data ends after {found}")
-        numbered = list(enumerate(rows, found - len(rows)))
-        yield load_text(numbered, "point", len(layout.names or ()), dtype=layout, ndmin=1)
-    if not count:
-        yield np.empty(0, layout)
-
-
-def binary_rows(file: BufferedIOBase, count: int, layout: np.dtype) -> Iterator[np.ndarray]:
-    """`count` records of binary data from the file's place on, some at a time."""
-    size, found = layout.itemsize, 0
-    if not size:
+def read_rows(file: BufferedIOBase, count: int, layout: np.dtype, text: bool) -> Iterator[np.ndarray]:
+    """`count` records from the file's place on, of lines of text or of bytes, some at a time."""
+    if not count or not layout.itemsize:
         yield np.empty(0, layout)
         return
-    while found < count:
-        wanted = min(max(1, PIECE_BYTES // size), count - found)
-        data = file.read(wanted * size)
-        if len(data) < wanted * size:
-            raise UserError(
-                f"is cut off: its header announces {count} points, the data ends after {found + len(data) // size}"
-            )
-        yield np.frombuffer(data, layout, wanted)
-        found += wanted
-    if not count:
-        yield np.empty(0, layout)
+    step = PIECE_LINES if text else max(1, PIECE_BYTES // layout.itemsize)
+    for found in range(0, count, step):
+        wanted = min(step, count - found)
+        lines = list(enumerate(islice(_lines(file), wanted), found)) if text else []
+        data = b"" if text else file.read(wanted * layout.itemsize)
+        held = len(lines) + len(data) // layout.itemsize
+        if held < wanted:
+            raise UserError(f"is cut off: its header announces {count} points, the data ends after {found + held}")
+        names = layout.names or ()
+        yield load_text(lines, "point", len(names), dtype=layout, ndmin=1) if text else np.frombuffer(data, layout)

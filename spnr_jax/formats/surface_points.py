@@ -11,8 +11,8 @@ coordinates, so that two of its edges give both directions; they are made perpen
 Where the coordinates have no area the normal stays.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it co
 CANDIDATES = 4  # points drawn for each that is kept of an even spread
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurfacePoints:
+class SurfacePoints(NamedTuple):
     """Points (n,) on a surface, float32: linear colours and materials in [0, 1], unit normals, global face (int32)."""
 
     positions: np.ndarray
@@ -74,7 +73,7 @@ def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "r
         return _random_points(asset, num_points, seed)
     drawn = _random_points(asset, CANDIDATES * num_points, seed)
     chosen = farthest_points(drawn.positions, num_points, seed)
-    return SurfacePoints(**{column.name: getattr(drawn, column.name)[chosen] for column in fields(SurfacePoints)})
+    return SurfacePoints(*(column[chosen] for column in drawn))
 
 
 def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
@@ -117,7 +116,7 @@ def _draw_points(
 
 def face_areas(part: Part) -> np.ndarray:
     """Areas (f,) of a part's triangles."""
-    return np.linalg.norm(face_crosses(part), axis=-1) / 2
+    return np.linalg.norm(face_crosses(part.positions, part.faces), axis=-1) / 2
 
 
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
@@ -138,7 +137,7 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[
     opacity, normal_map = (channels.pop(name, None) for name in TEXTURES)
     if part.colors is not None:
         channels["base_color"] = channels["base_color"] * interpolate(part.colors)
-    geometric = unit(face_crosses(part)[face])
+    geometric = unit(face_crosses(part.positions, part.faces[face]))
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
     if normal_map is not None and part.texcoords is not None:
         corners = part.faces[face]
@@ -153,17 +152,16 @@ def _uniform_barycentric(uniform: np.ndarray) -> np.ndarray:
     return np.concatenate([1 - root, root * (1 - uniform[:, 1:]), root * uniform[:, 1:]], axis=-1)
 
 
-def face_crosses(part: Part) -> np.ndarray:
+def face_crosses(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Normals (f, 3) of twice the triangles' area."""
-    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
+    a, b, c = np.moveaxis(positions[faces], 1, 0)
     return np.cross(b - a, c - a)
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit mean normals (v, 3) of the faces (f, 3) around each vertex, weighted by area; y where there is none."""
-    a, b, c = np.moveaxis(positions[faces], 1, 0)
     sums = np.zeros_like(positions)
-    np.add.at(sums, faces, np.cross(b - a, c - a)[:, None])
+    np.add.at(sums, faces, face_crosses(positions, faces)[:, None])
     return unit(sums, np.array([0.0, 1.0, 0.0]))
 
 

@@ -8,8 +8,9 @@ import trimesh
 from PIL import Image
 from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder
 
+from data_gen.plan.sources import find_meshes
 from spnr_jax.formats.assets import RejectedAsset
-from spnr_jax.formats.meshes import find_meshes, load_mesh
+from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -83,7 +84,7 @@ def test_each_hard_file_is_read_or_refused_with_the_right_reason():
                 load_mesh(path)
             continue
         points = sample_surface(normalise(load_mesh(path))[0], 256, 0)
-        assert all(np.isfinite(values).all() for values in vars(points).values())
+        assert all(np.isfinite(values).all() for values in points)
         for values in (points.base_color, points.roughness, points.metallic):
             assert 0 <= values.min() <= values.max() <= 1
         np.testing.assert_allclose(np.linalg.norm(points.normals, axis=-1), 1, atol=1e-5)

@@ -30,23 +30,21 @@ def test_centre_goes_to_zero_and_half_the_diagonal_to_one():
     assert transform == {"centre": [11.5, 21.5, 32.0], "scale": pytest.approx(2 / np.sqrt(9 + 9 + 16))}
 
 
-def test_points_spread_by_area_over_parts_and_faces():
-    asset = Asset(parts=(square(1.0), square(3.0, (5, 0, 0)), square(0.0)))
-    count = np.bincount(sample_surface(asset, 20_000, 0).face, minlength=6) / 20_000
+def test_points_are_uniform_by_area_on_the_faces_that_they_name():
+    parts = (square(1.0), square(3.0, (5, 0, 0)), square(0.0), square(1.0, (0, 0, 3)))
+    points = sample_surface(Asset(parts=parts), 20_000, 0)
     # four standard deviations of a share of 20000 draws
-    np.testing.assert_allclose(count, [0.05, 0.05, 0.45, 0.45, 0, 0], atol=4 * 0.5 / np.sqrt(20_000))
-
-
-def test_every_point_lies_on_the_face_that_it_names():
-    parts = (square(2.0), square(1.0, (0, 0, 3)), square(1.5, (4, 1, -1)))
-    points = sample_surface(Asset(parts=parts), 500, 2)
+    expected = np.array([1, 1, 9, 9, 0, 0, 1, 1]) / 22
+    np.testing.assert_allclose(np.bincount(points.face) / 20_000, expected, atol=4 * 0.5 / np.sqrt(20_000))
     corners = np.concatenate([part.positions[part.faces] for part in parts])[points.face]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    inside = np.linalg.pinv(edges) @ (points.positions - corners[:, 0])[..., None]
-    rebuilt = (edges @ inside)[..., 0] + corners[:, 0]
-    np.testing.assert_allclose(rebuilt, points.positions, atol=1e-5)
+    inside = (np.linalg.pinv(edges) @ (points.positions - corners[:, 0])[..., None])[..., 0]
+    np.testing.assert_allclose((edges @ inside[..., None])[..., 0] + corners[:, 0], points.positions, atol=1e-5)
     assert inside.min() > -1e-5
     assert inside.sum(axis=1).max() < 1 + 1e-5
+    # moments of the uniform distribution on the triangle (0,0) (1,0) (0,1)
+    np.testing.assert_allclose(inside.mean(axis=0), [1 / 3, 1 / 3], atol=0.01)
+    np.testing.assert_allclose(np.cov(inside.T), [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], atol=2e-3)
 
 
 def test_the_material_is_looked_up_where_the_point_lies():
@@ -81,14 +79,6 @@ def test_normals_are_the_faces_or_the_interpolated_ones_and_always_unit():
     expected = np.stack([2 * smooth.positions[:, 0] - 1, np.zeros(200), np.ones(200)], axis=-1)
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
     np.testing.assert_allclose(smooth.normals, expected, atol=1e-5)
-
-
-def test_points_are_uniform_inside_a_triangle():
-    triangle = replace(square(), faces=FACES[:1])
-    points = sample_surface(Asset(parts=(triangle,)), 20_000, 1).positions
-    # moments of the uniform distribution on the triangle (0,0) (1,0) (1,1)
-    np.testing.assert_allclose(points.mean(axis=0), [2 / 3, 1 / 3, 0], atol=0.01)
-    np.testing.assert_allclose(np.cov(points.T)[:2, :2], [[1 / 18, 1 / 36], [1 / 36, 1 / 18]], atol=2e-3)
 
 
 # Normal maps

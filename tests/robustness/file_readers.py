@@ -148,9 +148,8 @@ def plain_meshes(suffix: str) -> list[Files]:
     box = trimesh.creation.box()
     if suffix == ".ply":
         box.visual.face_colors = np.tile([40, 170, 60, 255], (len(box.faces), 1))
-    content = box.export(file_type=suffix[1:])
-    text = {".stl": box.export(file_type="stl_ascii")}.get(suffix)
-    contents = (content, text) if text else (content,)
+    kinds = ("stl", "stl_ascii") if suffix == ".stl" else (suffix[1:],)
+    contents = [box.export(file_type=kind) for kind in kinds]
     return [{f"mesh{suffix}": data if isinstance(data, bytes) else data.encode()} for data in contents]
 
 
@@ -210,14 +209,11 @@ def splats() -> list[Files]:
     return [*spz, {"cloud.ply": packed_splats(WHOLE.positions / 8, 255)}]
 
 
-def run_files(name: str) -> list[Files]:
-    """A config of each preset, or rows of metrics."""
+def configs() -> list[Files]:
+    """A config of each preset."""
     from spnr_jax import presets
     from spnr_jax.methods import to_dict
 
-    if name == "metrics":
-        row = json.dumps({"step": 1, "loss": 0.5, "steps_per_second": 2.0}) + "\n"
-        return [{"metrics.jsonl": 5 * row.encode()}]
     return [{"config.json": json.dumps(to_dict(make()), indent=2).encode()} for make in presets.PRESETS.values()]
 
 
@@ -228,11 +224,6 @@ def datasets() -> list[Files]:
         paths = sorted(path for path in place.rglob("*") if path.is_file())
         files = {path.relative_to(place).as_posix(): path.read_bytes() for path in paths}
     return [{name: files[name]} | files for name in files if "00" not in name or "000" in name]
-
-
-def lists() -> list[Files]:
-    """A test list."""
-    return [{"list.txt": b"a\nb\n"}]
 
 
 def weights() -> list[Files]:
@@ -255,26 +246,23 @@ def uploads() -> list[Files]:
     return [{"content": next(iter(files.values())), "name.txt": next(iter(files)).encode()} for files in tables(".ply")]
 
 
-Reader = tuple[Callable[[], list[Files]], Callable[[Path, str], None]]
-READERS: dict[str, Reader] = {
+ROW = json.dumps({"step": 1, "loss": 0.5, "steps_per_second": 2.0}) + "\n"
+READERS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path, str], None]]] = {
     **{
-        suffix[1:]: (functools.partial(tables, suffix), read_cloud)
-        for suffix in (".ply", ".pcd", ".npz", ".npy", ".las")
+        name: (functools.partial(tables, f".{name}"), read_cloud) for name in ("ply", "pcd", "npz", "npy", "las", "laz")
     },
-    "laz": (functools.partial(tables, ".laz"), read_cloud),
     "text": (functools.partial(tables, ".xyz", ".csv", ".txt"), read_cloud),
     "splats": (splats, read_cloud),
-    **{f"mesh-{suffix[1:]}": (functools.partial(plain_meshes, suffix), read_cloud) for suffix in (".ply", ".stl")},
+    "mesh-ply": (functools.partial(plain_meshes, ".ply"), read_cloud),
+    "mesh-stl": (functools.partial(plain_meshes, ".stl"), read_cloud),
     "off": (lambda: [*plain_meshes(".off"), *tables(".off")], read_cloud),
     "obj": (objs, read_mesh),
     "gltf": (scenes, read_mesh),
     "gltf-packed": (lambda: [draco_square().files("mesh.gltf"), meshopt_files()], read_mesh),
-    **{
-        name: (functools.partial(run_files, name), read)
-        for name, read in (("config", read_config), ("metrics", read_metrics))
-    },
+    "config": (configs, read_config),
+    "metrics": (lambda: [{"metrics.jsonl": 5 * ROW.encode()}], read_metrics),
     "dataset": (datasets, read_dataset),
-    "lists": (lists, read_list),
+    "lists": (lambda: [{"list.txt": b"a\nb\n"}], read_list),
     "viewer-upload": (uploads, read_upload),
     "weights": (weights, read_network),
 }

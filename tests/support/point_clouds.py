@@ -3,7 +3,8 @@
 import numpy as np
 
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.point_files import column_pieces, join_pieces
+from spnr_jax.formats.point_files import column_pieces
+from spnr_jax.formats.row_files import join_pieces
 from spnr_jax.surfels.sides import spiral
 
 BALL = np.round(spiral(420), 4)
