@@ -7,9 +7,10 @@ object.
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset, Tolerance, TransparentParts
 from spnr_jax.formats.columns import LINEAR, Columns
@@ -31,7 +32,6 @@ READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_l
 DROPPED = {"KHR_lights_punctual", "EXT_mesh_gpu_instancing"}  # of what a scene may use
 SPLATS = "KHR_gaussian_splatting"
 NO_COLORS = np.ones((1, 3))
-SHORTEST_QUATERNION = 8.9e-16  # squared length below which there is no rotation
 OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
 # Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
 # costs as much as PLACING faces.
@@ -67,20 +67,11 @@ def _node_matrix(node: dict) -> np.ndarray:
     """Matrix (4, 4) from the node's frame to its parent's."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
-    matrix[:3, :3] = _rotation(node.get("rotation", (0, 0, 0, 1))) * node.get("scale", (1, 1, 1))
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    matrix = quaternion_matrix([w, x, y, z])
+    matrix[:3, :3] *= node.get("scale", (1, 1, 1))
     matrix[:3, 3] = node.get("translation", (0, 0, 0))
     return matrix
-
-
-def _rotation(quaternion: Any) -> np.ndarray:
-    """Rotation matrix (3, 3) of a quaternion x y z w of any length; the identity for 0."""
-    x, y, z, w = quaternion
-    q = np.array([w, x, y, z], np.float64)
-    squared = np.dot(q * q, np.ones(4))
-    q = q * np.sqrt(2.0 / squared) if squared > SHORTEST_QUATERNION else q * 0
-    _, (wx, xx, xy, xz), (wy, _, yy, yz), (wz, _, _, zz) = np.outer(q, q)
-    return np.array([[1 - yy - zz, xy - wz, xz + wy], [xy + wz, 1 - xx - zz, yz - wx], [xz - wy, yz + wx, 1 - xx - yy]])
 
 
 class Shape(NamedTuple):
