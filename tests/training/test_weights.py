@@ -100,7 +100,7 @@ BROKEN = {  # what is done to the file, and a part of what is said
     "of another type": (lambda file: change(file, lambda x: x.astype(np.float32)), WEIGHT),
     "not finite": (lambda file: change(file, lambda x: np.full_like(x, np.nan)), WEIGHT),
     "one more": (lambda file: rewrite(file, **{"params/more": np.zeros(3, np.float16)}), "no params/more"),
-    "a pickle": (lambda file: pickle(file), "objects"),
+    "a pickle": (lambda file: pickle(file), "Object arrays"),
 }
 
 
