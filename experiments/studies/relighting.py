@@ -115,7 +115,7 @@ def measure(options: RelightingStudy, model: Model, count: int, item: ObjectData
 def remove_shadows(volume: Volume) -> Volume:
     """The volume as if every direction saw every point."""
     surfels = volume.scene.surfels
-    surfels = dataclasses.replace(surfels, visible=jnp.ones_like(surfels.visible))
+    surfels = dataclasses.replace(surfels, visibility=jnp.ones_like(surfels.visibility))
     return dataclasses.replace(volume, scene=dataclasses.replace(volume.scene, surfels=surfels))
 
 
