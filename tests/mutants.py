@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TABLE = Path(__file__).with_suffix(".toml")
-COPIED = ("spnr_jax", "data_gen", "experiments", "tests", "pyproject.toml")
+COPIED = ("spnr_jax", "data_gen", "experiments", "tests", "docs", "pyproject.toml")
 LIMIT = 1800  # seconds for one call of pytest
 PASSED, FAILED = 0, 1  # exit codes of pytest; any other is a fault of the mutant or of the machine
 
@@ -68,7 +68,7 @@ def copy_project(folder: Path) -> Path:
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "images"))
         else:
             shutil.copy(source, folder / name)
     return folder

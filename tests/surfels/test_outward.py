@@ -67,7 +67,7 @@ def test_points_at_an_edge_have_the_normals_of_its_faces():
     points = np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([0 * x, y, x + 0.5 / 60], 1)])
     true = np.repeat([[0, 0, 1], [1, 0, 0]], len(x), axis=0)
     cosine = np.abs(np.sum(estimate_normals(points, points) * true, axis=1))
-    assert np.quantile(cosine, 0.02) > 0.9
+    assert np.quantile(cosine, 0.02) > 0.99  # without weights by height: 0.95
     assert np.median(cosine) > 0.9999
 
 
