@@ -26,6 +26,7 @@ from spnr_jax.formats.gltf_file import (
     decode_mesh,
     read_material,
 )
+from spnr_jax.formats.polygons import strip_faces
 
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_lights_punctual"}
@@ -192,6 +193,4 @@ def _triangles(order: np.ndarray, mode: str) -> np.ndarray:
         return np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_FAN":
         return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)
-    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other one of a strip is turned
-    return faces
+    return strip_faces(order)

@@ -120,7 +120,7 @@ def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | No
     kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
-            if read_ply_header(file).has_faces:
+            if read_ply_header(file).faces:
                 return None
     return READERS[kind](path) if kind in READERS else None
 

@@ -2,7 +2,7 @@
 
 Polygons become fans of triangles, or ears where they are not convex (Meisters 1975), so that a notch stays empty.
 
-.ply    elements vertex and face; colours by any of the names that those of points may have
+.ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have
 .stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
         the file counts where the count is 0
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]
@@ -27,19 +27,35 @@ OFF_HEAD = re.compile(r"(ST)?(C?)(N?)(4?)(n?)OFF\b")
 
 
 def load_ply_mesh(data: bytes) -> Asset:
-    """The raw asset of a PLY file with faces."""
+    """The raw asset of a PLY file with faces, or strips of them."""
     file = io.BytesIO(data)
     header = read_ply_header(file)
-    if not header.has_faces:
+    if (element := header.faces) is None:
         return Asset(parts=())
-    (vertices, _), (of_faces, lists) = read_elements(file, header, "vertex", "face").values()
+    (vertices, _), (of_faces, lists) = read_elements(file, header, "vertex", element).values()
     name = next((name for name in ("vertex_indices", "vertex_index") if name in lists), next(iter(lists), None))
     if name is None:
         raise RejectedAsset("has faces without lists of vertices: broken file")
     sizes, corners = lists[name]
+    if element == "tristrips":
+        strips = (strip for row in np.split(corners, np.cumsum(sizes)[:-1]) for strip in _ended(row))
+        corners = np.concatenate([np.zeros((0, 3), np.int64), *map(strip_faces, strips)]).ravel()
+        sizes, of_faces = np.full(len(corners) // 3, 3), {}
     texcoords = "texcoord" in lists or any(pair <= vertices.keys() for pair in TEXCOORDS)
     ignored = ("texture coordinates (of formats other than glTF and OBJ)",) if texcoords else ()
     return _colored(vertices, corners, sizes, of_faces, ignored)
+
+
+def strip_faces(order: np.ndarray) -> np.ndarray:
+    """Triangles (f, 3) of a strip of vertices (n,), every other one turned."""
+    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1) if len(order) > 2 else np.zeros((0, 3), np.int64)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def _ended(row: np.ndarray) -> list[np.ndarray]:
+    """The strips of a row of vertices, which -1 ends."""
+    return [strip[strip >= 0] for strip in np.split(row, np.flatnonzero(row == -1))]
 
 
 def _colored(

@@ -39,6 +39,7 @@ TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
+FACES = ("face", "tristrips")  # elements that make a PLY a mesh
 BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_HEADER_LIMIT = 2**20  # bytes
 LONGEST_LIST = 2**20  # items
@@ -51,9 +52,9 @@ class PlyHeader(NamedTuple):
     elements: list[Element]  # in the order of the file
 
     @property
-    def has_faces(self) -> bool:
-        """Whether it is a mesh."""
-        return any(name == "face" and count for name, count, _ in self.elements)
+    def faces(self) -> str | None:
+        """The element of faces that make it a mesh."""
+        return next((name for name, count, _ in self.elements if name in FACES and count), None)
 
 
 def read_ply_header(file: BufferedIOBase) -> PlyHeader:

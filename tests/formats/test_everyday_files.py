@@ -95,6 +95,10 @@ COLORED_MESHES = {
         "a.ply",
         square_ply("uchar", RGB, GREEN).replace("face 2", "face 3") + "4 0 1 2 3\n",
     ),
+    "strip": (
+        "a.ply",
+        square_ply("uchar", RGB, GREEN)[:-16].replace("face 2", "tristrips 1") + "5 0 1 3 2 -1\n",
+    ),
     "STOFF": ("a.off", "STCOFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255 0 1\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OBJ of bare CR": ("a.obj", ("".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE).replace("\n", "\r")),
     "OBJ with a byte order mark": ("a.obj", "\ufeff" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
