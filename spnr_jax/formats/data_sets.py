@@ -13,15 +13,13 @@ import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, refusing
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
 from spnr_jax.formats.assets import decode_image
 from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
-# what a file that breaks its rules makes its reader raise
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 LONGEST_NAME = 200  # of an object, in bytes: file systems allow 255
 
 
@@ -114,7 +112,9 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
         lights = _lights(read(file := "lights.npz"), len(names)) if has_lights(dataset) else None
-    except UNREADABLE as error:
+    except Exception as error:
+        if isinstance(error, MemoryError) or is_bug(error):
+            raise
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
         raise UserError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
@@ -138,8 +138,7 @@ def _lights(content: bytes, views: int) -> np.ndarray:
 
 
 def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
-    with refusing("is no picture"):
-        image = decode_image(content)
+    image = decode_image(content)
     if image.shape[:2] != (height, width):
         raise UserError(f"{image.shape[1]} x {image.shape[0]} pixels, transforms.json says {width} x {height}")
     return image

@@ -11,6 +11,7 @@ from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_sq
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
 from support.point_tables import WHOLE, as_scan
 
+from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import RejectedAsset
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.columns import srgb_to_linear
@@ -269,7 +270,7 @@ def test_meshopt_data_is_what_its_encoders_decoder_says_and_cut_anywhere_it_is_r
     theirs, ours = (np.frombuffer(data, "<i2").astype(int) for data in (case["plain"], found))
     np.testing.assert_allclose(ours, theirs, atol=1 if name == ROUNDED else 0)
     for length in {*range(0, len(case["packed"]), 7), len(case["packed"]) - 1}:
-        with pytest.raises(ValueError, match="holds meshopt"):
+        with pytest.raises(UserError, match="holds meshopt"):
             unpack(memoryview(case["packed"][:length]), case)
 
 
@@ -278,7 +279,7 @@ def test_meshopt_counts_widths_formats_and_filters_that_cannot_be_are_refused():
     changes = [{"byteStride": stride} for stride in (0, 3, 6, 260)] + [{"packed": b"\xa7" + case["packed"][1:]}]
     changes += [{"count": count} for count in (case["count"] * 2**6, 3 * 2**28, -3)]  # before room is made for them
     for change in (*changes, *({"filter": kind} for kind in ("SEPIA", "QUATERNION", "COLOR"))):
-        with pytest.raises(ValueError, match="broken|cannot be read"):
+        with pytest.raises(UserError, match="broken|cannot be read"):
             unpack(memoryview((case | change)["packed"]), case | change)
 
 
@@ -326,5 +327,5 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
         extra = "formats" if path.suffix == ".las" else "meshes"
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, package, None)
-            with pytest.raises(ValueError, match=rf"needs the package {package} .* 'spnr-jax\[{extra}\]'"):
+            with pytest.raises(UserError, match=rf"needs the package {package} .* 'spnr-jax\[{extra}\]'"):
                 read_cloud(path)

@@ -164,7 +164,7 @@ def turn_camera(whole):
 @pytest.mark.parametrize(
     ("name", "damage", "expected"),
     [
-        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: cannot be read (is no picture"),
+        ("objects/thing_0/images/000.png", lambda _: b"not a picture", "000.png: cannot be read (is not an image)"),
         ("objects/thing_1/points.ply", damage_points, "thing_1/points.ply: cannot be read (holds 1 points"),
         ("objects/thing_2/transforms.json", turn_camera, "orthonormal"),
         ("splits/val.txt", lambda _: b"thing_0\nthing_1\nthing_2\nthing_3\n", "listed more than once"),
