@@ -24,6 +24,7 @@ from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.surfel_renderer import Sizes, WindowBuffer
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
+from spnr_jax.surfels import symmetry
 from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
 from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.lighting import room_light
@@ -70,11 +71,12 @@ def encode_in_box(cloud: PointCloud) -> SurfelScene:
 
 
 def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
-    """A sparse cloud in the box (unbatched) with learned points added, if the variables include a densifier."""
+    """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier."""
     count = int(np.sum(cloud.mask))
     if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
-    padded = cloud_arrays.pad(cloud_arrays.strip(cloud), cloud_arrays.bucket(count))
+    real = symmetry.complete(cloud_arrays.strip(cloud))
+    padded = cloud_arrays.pad(real, cloud_arrays.bucket(len(real.mask)))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 

@@ -1,0 +1,181 @@
+"""Mirror symmetry of a sparse cloud: its points reflected in the planes about which it is symmetric.
+
+Most furniture and vehicles are their own mirror images, but the points of one half do not mirror those of the other:
+the reflected points lie between the measured ones, and on the surface.
+
+candidates  planes through the centroid, near which every plane of symmetry passes; those whose reflected points lie
+            nearest to the cloud are refined
+refinement  the reflected points are registered to the cloud (point-to-plane ICP, Chen and Medioni 1992)
+acceptance  around most points, the reflected ones lie as far from the nearest measured one as other points of the
+            surface would; only those points are reflected, so that what is on one side alone is not copied
+
+NumPy on the host, for a cloud in the box: choices, without a gradient.  Lengths are in spacings unless stated.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from spnr_jax.kernels.records import PointCloud
+from spnr_jax.surfels.normals import estimate_normals
+from spnr_jax.surfels.sides import spiral
+
+FEWEST_POINTS, MOST_POINTS = 128, 2048  # of a cloud that is completed
+MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
+CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
+SCORING = 256  # points that score a candidate
+ROUNDS, ROBUST = 13, (0.5, 0.05)  # of the registration; first and last height at which a point has half its weight
+MATCHES = 4  # nearest points among which a reflected point is matched
+FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
+RANDOM, COVERED, BOUNDS = 0.54, 0.65, (0.36, 0.55)  # of `expect_distance`; measured on chairs and balls
+AROUND = 12  # neighbors over which distances are averaged
+FITS, LEAST_SHARE = 1.4, 0.8  # times the expected distance up to which points fit; share of them in a symmetric cloud
+NEAREST, FARTHEST = 0.3, 0.8  # distances from measured points between which a reflected point is kept
+UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected point does not fit its match
+
+
+class Surface(NamedTuple):
+    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points."""
+
+    position: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    spacing: float
+    around: Int[np.ndarray, "n 12"]
+    tree: cKDTree
+
+
+class Reflection(NamedTuple):
+    """Points reflected in the plane normal . x = offset, each with the measured point that it matches.
+
+    `distance` is that to the nearest measured point; height over the plane of the match and cosine of the normals.
+    """
+
+    position: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    match: Int[np.ndarray, " n"]
+    height: Float[np.ndarray, " n"]
+    cosine: Float[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+
+
+class Plane(NamedTuple):
+    """The points x with normal . x = offset; `distance` is the mean from reflected points to the nearest measured one.
+
+    `fits` says which points have reflected ones around them as near as expected.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    distance: float
+    fits: Bool[np.ndarray, " n"]
+
+
+def complete(cloud: PointCloud) -> PointCloud:
+    """The cloud (unbatched, without padding), then its points reflected in up to two planes of symmetry.
+
+    The same cloud if it has too few or too many points, or no symmetry.  Reflected points keep their material; where
+    the surface has another color there are none, because a pattern need not be symmetric.
+    """
+    if not FEWEST_POINTS <= len(cloud.mask) <= MOST_POINTS:
+        return cloud
+    chosen: list[Plane] = []
+    for plane in find_planes(measure_surface(cloud)):
+        if len(chosen) < MOST_PLANES and all(abs(plane.normal @ other.normal) < ORTHOGONAL for other in chosen):
+            chosen.append(plane)
+    for plane in chosen:
+        cloud = add_reflected(cloud, plane.normal, plane.offset)
+    return cloud
+
+
+def measure_surface(cloud: PointCloud) -> Surface:
+    """The points of a cloud with their normals, given or estimated."""
+    position = np.asarray(cloud.positions, np.float64)
+    tree = cKDTree(position)
+    distance, around = tree.query(position, list(range(1, AROUND + 1)))
+    spacing = max(float(np.median(distance[:, 1:7].mean(axis=1))), np.finfo(np.float64).tiny)
+    normal = estimate_normals(position, position) if cloud.normals is None else np.asarray(cloud.normals, np.float64)
+    return Surface(position, normal, spacing, around, tree)
+
+
+def find_planes(surface: Surface) -> list[Plane]:
+    """Planes of symmetry, the best first."""
+    centroid = surface.position.mean(axis=0)
+    axes = np.linalg.eigh(np.cov(surface.position.T))[1].T
+    normals = np.concatenate([axes, spiral(CANDIDATES)[: CANDIDATES // 2] @ axes])
+    sample = surface.position[:: -(-len(surface.position) // SCORING)]
+    across = 2 * (sample - centroid) @ normals.T
+    distance = surface.tree.query(sample[:, None] - across[..., None] * normals, workers=-1)[0]
+    score = np.minimum(distance / surface.spacing, FAR).mean(axis=0)
+    refined: list[np.ndarray] = []
+    for normal in normals[np.argsort(score, kind="stable")]:
+        if len(refined) < REFINED and all(abs(normal @ other) < DISTINCT for other in refined):
+            refined.append(normal)
+    planes = [register(surface, normal, float(centroid @ normal)) for normal in refined]
+    return sorted((x for x in planes if x.fits.mean() > LEAST_SHARE), key=lambda x: x.distance)
+
+
+def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
+    """The plane after point-to-plane registration of the reflected points to the cloud, robustly weighted."""
+    for robust in np.geomspace(*ROBUST, ROUNDS):
+        found = reflect(surface, normal, offset)
+        weight = (found.distance < FAR) * (found.cosine > LEAST_COSINE) / (1 + (found.height / robust) ** 2)
+        tangents = np.linalg.svd(normal[None])[2][1:]
+        target = surface.normal[found.match]
+        before, facing = surface.position @ normal - offset, target @ normal
+        turns = [(surface.position @ x) * facing + before * (target @ x) for x in tangents]
+        slopes = 2 * np.stack([*turns, -facing], axis=1)
+        weighted = slopes * weight[:, None]
+        step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (found.height * surface.spacing), rcond=1e-6)[0]
+        turned = normal + step[:2] @ tangents
+        length = np.linalg.norm(turned)
+        normal, offset = turned / length, float((offset + step[2]) / length)
+    distance = reflect(surface, normal, offset).distance
+    return Plane(normal, offset, float(distance.mean()), find_fitting(surface, distance))
+
+
+def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Reflection:
+    """The points reflected in a plane, each matched to one of the nearest points by place and normal."""
+    reflected = surface.position - 2 * (surface.position @ normal - offset)[:, None] * normal
+    normals = surface.normal - 2 * (surface.normal @ normal)[:, None] * normal
+    distance, near = surface.tree.query(reflected, MATCHES)
+    distance, facing = distance / surface.spacing, surface.normal[near]
+    cosine = np.abs(np.einsum("ni,nki->nk", normals, facing))
+    height = np.einsum("nki,nki->nk", reflected[:, None] - surface.position[near], facing) / surface.spacing
+    rows, best = np.arange(len(near)), np.argmin(np.abs(height) + 0.3 * distance + 1 - cosine, axis=1)
+    match = near[rows, best], height[rows, best], cosine[rows, best]
+    return Reflection(reflected, normals, *match, np.minimum(distance[:, 0], FAR))
+
+
+def expect_distance(surface: Surface) -> float:
+    """Mean distance from other points of the surface to the nearest point, from the mean distance between points.
+
+    Among random points both are alike; even points lie farther apart and leave smaller gaps.
+    """
+    own = surface.tree.query(surface.position, [2])[0].mean() / surface.spacing
+    return float(np.clip(RANDOM - COVERED * (own - RANDOM), *BOUNDS))
+
+
+def find_fitting(surface: Surface, distance: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Where the reflected points of a neighborhood lie at these distances as other points of the surface would."""
+    return distance[surface.around].mean(axis=1) < FITS * expect_distance(surface)
+
+
+def add_reflected(cloud: PointCloud, normal: Float[np.ndarray, "3"], offset: float) -> PointCloud:
+    """The cloud, then its points reflected in a plane, where they fit and do not lie next to a measured point."""
+    surface = measure_surface(cloud)
+    found = reflect(surface, normal, offset)
+    fits = find_fitting(surface, found.distance)
+    roots = np.sqrt(np.asarray(cloud.base_color))
+    alike = np.linalg.norm(roots[found.match] - roots, axis=1) < UNLIKE
+    kept = np.flatnonzero(fits & alike & (found.distance > NEAREST) & (found.distance < FARTHEST))
+    added = {"positions": found.position[kept], "normals": found.normals[kept]}
+
+    def extend(name: str, values: np.ndarray) -> np.ndarray:
+        more = added[name] if name in added else values[kept]
+        return np.concatenate([values, more.astype(values.dtype)])
+
+    columns = {name: extend(name, np.asarray(x)) for name, x in vars(cloud).items() if x is not None}
+    return dataclasses.replace(cloud, **columns)
