@@ -25,6 +25,7 @@ from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
+from spnr_jax.surfels.layers import CONSTANTS
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
 SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims and on curves
@@ -43,6 +44,9 @@ LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
 EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
+GRAPH = dataclasses.replace(
+    CONSTANTS, even_distance=0.515
+)  # even points with reflected ones (surfels/symmetry.py) have 0.53
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
 LEAST_PROBABILITY = 0.55  # probability above which a learned point is kept
 
@@ -85,7 +89,7 @@ class LearnedPoints(NamedTuple):
 
 def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Candidates]:
     """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
-    nodes = describe_nodes(estimate_surfels(cloud, neighbors))
+    nodes = describe_nodes(estimate_surfels(cloud, neighbors, GRAPH))
     return nodes, place_candidates(nodes, neighbors)
 
 
