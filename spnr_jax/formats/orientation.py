@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from spnr_jax.formats.row_files import camera_row, read_pcd_header
+from spnr_jax.formats.row_files import element_pieces, read_pcd_header, read_ply_header
 from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
@@ -78,26 +78,32 @@ class Sensor(NamedTuple):
 
 def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
     """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
-    if kind == ".pcd":
-        header = read_pcd_header(path)
-        if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
-            return None
-        place = np.array(header.sensor)
-        if header.organised or _from_there(positions, place, OPEN):
-            return Sensor(place, _up_of_image(positions - place))
-        if place.any() and _from_there(positions, place, MOST, within=True):
-            return Sensor(place)
-        if place.any():
-            report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
-        return None
-    if kind != ".ply":
+    if kind == ".ply":
+        return _camera_of(path)
+    if kind != ".pcd":
         return None
     with path.open("rb") as file:
-        try:
-            row = camera_row(file)
-        except ValueError:  # the points can do without
+        header = read_pcd_header(file)
+    if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
+        return None
+    place = np.array(header.sensor)
+    if header.organised or _from_there(positions, place, OPEN):
+        return Sensor(place, _up_of_image(positions - place))
+    if place.any() and _from_there(positions, place, MOST, within=True):
+        return Sensor(place)
+    if place.any():
+        report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
+    return None
+
+
+def _camera_of(path: Path) -> Sensor | None:
+    """The camera that a PLY file begins with."""
+    with path.open("rb") as file:
+        header = read_ply_header(file)
+        if [name for name, _, _ in header.elements][:1] != ["camera"]:
             return None
-    place, above = (np.array([row.get(name, np.nan) for name in names]) for names in (PLACE, UP))
+        _, columns, _ = next(element_pieces(file, header, "camera"))
+    place, above = (np.array([columns.get(name, [np.nan])[0] for name in names], float) for names in (PLACE, UP))
     if not (np.abs(place) < FARTHEST).all():
         return None
     if not (np.isfinite(above).all() and above.any()):
