@@ -156,9 +156,9 @@ def plain_names(table: np.ndarray) -> tuple[str, ...]:
         more[7] = (*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)
     if count not in more:
         raise UserError(
-            f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, 6, "
-            "7, 8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b nx ny "
-            "nz), or a header line that names the columns"
+            f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, "
+            "6, 7, 8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b and "
+            "nx ny nz), or a header line that names the columns"
         )
     return (*POSITION, *more[count])
 
