@@ -89,9 +89,9 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
     place = np.array(header.sensor)
     if header.organised or _from_there(positions, place, OPEN):
         return Sensor(place, _up_of_image(positions - place))
-    if place.any() and _from_there(positions, place, MOST, within=True):
-        return Sensor(place)
     if place.any():
+        if _from_there(positions, place, MOST, within=True):
+            return Sensor(place)
         report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
     return None
 
