@@ -62,7 +62,7 @@ def turn_half(gaussians: Gaussians) -> Gaussians:
     return Gaussians(
         scale=gaussians.scale,
         opacity=gaussians.opacity,
-        position=np.asarray(gaussians.position, np.float32) * np.float32([1, -1, -1]),
+        position=np.asarray(gaussians.position, np.float32) * np.array([1, -1, -1], np.float32),
         rotation=np.stack([-x, w, -z, y], axis=-1),
         harmonics=harmonics * half_turn_signs(degree_of(harmonics.shape[1])).astype(np.float32)[:, None],
     )

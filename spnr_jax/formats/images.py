@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -137,7 +138,13 @@ def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
     images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
-    how = {"save_all": True, "append_images": images[1:], "duration": milliseconds, "loop": 0, "optimize": False}
+    how: dict[str, Any] = {
+        "save_all": True,
+        "append_images": images[1:],
+        "duration": milliseconds,
+        "loop": 0,
+        "optimize": False,
+    }
     images[0].save(stream, "gif", **how)
     return stream.getvalue()
 
@@ -161,8 +168,10 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
 
 def template(path: Path) -> Template:
     """The template of a page in a file; a name that it uses and is not given is an error."""
-    loader, shape = FileSystemLoader([path.parent, Path(__file__).parent]), {"trim_blocks": True, "lstrip_blocks": True}
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **shape).get_template(path.name)
+    loader = FileSystemLoader([path.parent, Path(__file__).parent])
+    return Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).get_template(path.name)
 
 
 def read_light(source: Path | str, normalise: bool = True) -> Light:

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from io import BufferedIOBase
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.point_tables import load_text
 
-Properties = list[tuple[str, str, int | str]]
+Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
 Lists = dict[str, tuple[np.ndarray, ...]]  # lengths (rows,), and the items of all rows one behind the other
 
 PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the points that are in memory at a time
@@ -109,6 +109,7 @@ def _any_rows(
     sizes: dict[str, list[int]] = {name: [] for name, _, width in properties if isinstance(width, str)}
     lines = _lines(file)
     for row in range(before, before + count):
+        data: Any
         words = next(lines, "").split() if text else []
         for name, kind, width in properties:
             if isinstance(width, str):
