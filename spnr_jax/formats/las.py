@@ -66,7 +66,9 @@ def _check_sizes(content: mmap.mmap) -> None:
         raise UserError(f"is broken: {records} records in its header, points from byte {data} of {len(content)} on")
     if not kind & COMPRESSED:
         if not length or data + points * length > len(content):
-            raise UserError(f"is cut off: its header announces {points} points of {length} bytes in {len(content)}")
+            raise UserError(
+                f"is cut off: its header announces {points} points of {length} bytes in {len(content)} bytes"
+            )
         return
     for _ in range(records):
         name, number, size = struct.unpack_from("<16sHH", content, place + 2)

@@ -107,30 +107,32 @@ def _any_rows(
     """`count` rows one by one, behind those `before`, with lists of any lengths."""
     raw: dict[str, list] = {name: [] for name, *_ in properties}
     sizes: dict[str, list[int]] = {name: [] for name, _, width in properties if isinstance(width, str)}
-    lines = _lines(file)
+    lines, row, words = _lines(file), before, [""]
+
+    def take(kind: str, number: int) -> Any:
+        nonlocal words
+        size = number * (1 if text else np.dtype(kind).itemsize)
+        data, words = (words[:size], words[size:]) if text else (file.read(size), words)
+        if len(data) < size:
+            raise UserError(f"is cut off: row {row} of a PLY element ends too early")
+        return data
+
+    def join(parts: list, kind: str) -> np.ndarray:
+        if not text:
+            return np.frombuffer(b"".join(parts), kind)
+        with refusing(f"has up to row {row} of a PLY element other things than numbers"):
+            return np.array(list(chain(*parts)), str).astype(kind)
+
     for row in range(before, before + count):
-        data: Any
-        words = next(lines, "").split() if text else []
+        words = next(lines, "").split() if text else words
         for name, kind, width in properties:
             if isinstance(width, str):
-                data, words = (words[:1], words[1:]) if text else (file.read(np.dtype(width).itemsize), words)
-                with refusing(f"row {row} of a PLY element: is cut off, or has a list without a length"):
-                    width = int(data[0] if text else np.frombuffer(data, width)[0])
+                width = int(join([take(width, 1)], width)[0])
                 if not 0 <= width <= LONGEST_LIST:
                     raise UserError(f"has a list of {width} items in row {row} of a PLY element: broken file")
                 sizes[name].append(width)
-            size = width if text else width * np.dtype(kind).itemsize
-            data, words = (words[:size], words[size:]) if text else (file.read(size), words)
-            if len(data) < size:
-                raise UserError(f"is cut off: row {row} of a PLY element ends too early")
-            raw[name].append(data)
-    with refusing("has a PLY element of other things than numbers"):
-        values = {
-            name: np.array(list(chain(*raw[name])), str).astype(kind)
-            if text
-            else np.frombuffer(b"".join(raw[name]), kind)
-            for name, kind, _ in properties
-        }
+            raw[name].append(take(kind, width))
+    values = {name: join(raw[name], kind) for name, kind, _ in properties}
     columns = {name: values[name] for name, _, width in properties if width == 1}
     return columns, {name: (np.array(sizes[name], np.int64), values[name]) for name in sizes}
 
