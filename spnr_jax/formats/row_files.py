@@ -15,7 +15,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator
-from io import BufferedIOBase
+from io import BufferedIOBase, BytesIO
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -268,7 +268,7 @@ def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
         place = tuple(map(float, entries.get("VIEWPOINT", [])[:3]))
         sensor = place if len(place) == 3 and all(map(math.isfinite, place)) else None
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
-    return PcdHeader(properties, num_points, encoding, organised, sensor)
+    return PcdHeader([field for field in properties if field[2]], num_points, encoding, organised, sensor)
 
 
 def pcd_pieces(path: Path) -> Iterator[Columns]:
@@ -284,25 +284,20 @@ def pcd_pieces(path: Path) -> Iterator[Columns]:
 
 def _packed_columns(body: bytes, header: PcdHeader) -> Columns:
     """The columns of a compressed file, one field of all points after the other."""
-    widths = {name: np.dtype(kind).itemsize * width for name, kind, width in header.properties}
-    announced = sum(widths.values()) * header.num_points
     compressed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
-    packed = body[8 : 8 + compressed]
+    packed, columns = body[8 : 8 + compressed], {}
     if len(body) < 8 or len(packed) < compressed:
         raise UserError(f"is cut off: expected {compressed} bytes of compressed data, found {len(packed)}")
-    if plain != announced:
-        raise UserError(f"announces {plain} bytes of points, its header {announced}")
     try:
-        unpacked = decompress(packed, plain)
+        stream = BytesIO(decompress(packed, plain))
     except UserError:
         if compressed != plain:
             raise
-        unpacked = packed  # some writers announce compressed data and store it as it is
-    columns, start = {}, 0
-    for name, kind, width in header.properties:
-        if width == 1:
-            columns[name] = np.frombuffer(unpacked, kind, header.num_points, start)
-        start += widths[name] * header.num_points
+        stream = BytesIO(packed)  # some writers announce compressed data and store it as it is
+    for field in header.properties:
+        columns |= join_pieces(found for found, _ in read_rows(stream, header.num_points, [field], text=False))
+    if stream.read(1):
+        raise UserError(f"announces {plain} bytes of points, its header fewer")
     return columns
 
 
