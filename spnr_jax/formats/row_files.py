@@ -285,7 +285,8 @@ def pcd_pieces(path: Path) -> Iterator[Columns]:
 def _packed_columns(body: bytes, header: PcdHeader) -> Columns:
     """The columns of a compressed file, one field of all points after the other."""
     compressed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
-    packed, columns = body[8 : 8 + compressed], {}
+    packed = body[8 : 8 + compressed]
+    columns: Columns = {}
     if len(body) < 8 or len(packed) < compressed:
         raise UserError(f"is cut off: expected {compressed} bytes of compressed data, found {len(packed)}")
     try:
