@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, is_bug, require
+from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
 from spnr_jax.formats.assets import decode_image
 from spnr_jax.formats.point_tables import read_arrays
@@ -62,42 +62,54 @@ class Dataset:
 def open_dataset(folder: Path | str) -> Dataset:
     """The data set in a folder; ValueError if it is none or unfinished."""
     folder = Path(folder)
-    description, again = folder / "dataset.json", f"run `spnr-data generate {folder}`"
-    require(description.is_file(), f"{folder}: no finished data set (dataset.json is missing); {again}")
+    description = folder / "dataset.json"
+    if not description.is_file():
+        raise UserError(f"{folder}: no finished data set (dataset.json is missing); run `spnr-data generate {folder}`")
     try:
         settings = json.loads(description.read_text())
     except (ValueError, RecursionError) as error:
         raise UserError(f"{description}: not valid JSON ({error}); generate the data set again") from None
-    require(isinstance(settings, dict), f"{description}: holds no settings; generate the data set again")
+    if not isinstance(settings, dict):
+        raise UserError(f"{description}: holds no settings; generate the data set again")
     splits = {}
     for split in ("train", "val", "test"):
         path = folder / "splits" / f"{split}.txt"
-        require(path.is_file(), f"{path}: missing; {again} again, it completes the data set")
+        if not path.is_file():
+            raise UserError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
         splits[split] = tuple(path.read_text(errors="replace").split())
-        strange = next((name for name in splits[split] if not is_plain_name(name)), None)
-        require(strange is None, f"{path}: {strange!r} is no name of an object; generate the data set again")
+        if strange := [name for name in splits[split] if not is_plain_name(name)]:
+            raise UserError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
     return Dataset(folder=folder, settings=settings, splits=splits)
 
 
 def is_plain_name(name: str) -> bool:
     """Whether a name in a data set's lists is that of a folder right there: no path, nothing hidden."""
-    short = 0 < len(name) <= LONGEST_NAME
-    return short and name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
+    return (
+        0 < len(name) <= LONGEST_NAME and name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
+    )
 
 
 def read_object(dataset: Dataset, name: str) -> ObjectData:
     """One object of the data set; ValueError names the file that is missing or broken."""
-    folder, file = dataset.folder / "objects" / name, "transforms.json"
+    folder = dataset.folder / "objects" / name
+    file = "transforms.json"
 
     def read(file: str) -> bytes:
         return (folder / file).read_bytes()
 
     try:
-        camera, names = _read_camera(read(file))
-        pictures = {
-            kind: np.stack([_rgba(read(file := f"{kind}/{name}"), camera.height, camera.width) for name in names])
-            for kind in ("images", "conditions")
-        }
+        meta = json.loads(read(file))
+        with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
+            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
+            intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
+        names = [Path(frame["file_path"]).name for frame in meta["frames"]]
+        height, width = int(meta["h"]), int(meta["w"])
+        if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
+            raise UserError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
+        if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
+            raise UserError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
+        images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
+        conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
         lights = _lights(read(file := "lights.npz"), len(names)) if has_lights(dataset) else None
     except Exception as error:
@@ -106,22 +118,10 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
         raise UserError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
-    return ObjectData(name=name, cloud=cloud, camera=camera, lights=lights, **pictures)
-
-
-def _read_camera(content: bytes) -> tuple[Camera, list[str]]:
-    """The cameras of an object's views and the names of their pictures."""
-    meta = json.loads(content)
-    with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
-        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
-        intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
-    finite = poses.shape[1:] == (3, 4) and np.isfinite(poses).all() and np.isfinite(intrinsics).all()
-    require(bool(finite), "a camera holds NaN or infinity, or is no 4 x 4 matrix")
-    positive = min(intrinsics[0, 0], intrinsics[1, 1]) > 0
-    require(bool(positive), f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
-    intrinsics = np.broadcast_to(intrinsics, (len(poses), 3, 3))
-    camera = Camera(cam_to_world=poses, intrinsics=intrinsics, height=int(meta["h"]), width=int(meta["w"]))
-    return camera, [Path(frame["file_path"]).name for frame in meta["frames"]]
+    camera = Camera(
+        cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
+    )
+    return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions, lights=lights)
 
 
 def has_lights(dataset: Dataset) -> bool:

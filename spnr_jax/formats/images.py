@@ -16,14 +16,13 @@ from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from PIL import Image
 
-from spnr_jax.errors import UserError, first_line, require
+from spnr_jax.errors import UserError, first_line
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.lighting import light_of
@@ -84,10 +83,13 @@ def png_url(image: np.ndarray | Array) -> str:
 
 def check_place(path: Path) -> None:
     """ValueError if no file can be written at a path: it is asked before the work, not after it."""
-    require(not path.is_dir(), f"{path}: a folder; expected the name of a file")
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected the name of a file")
     above = next(folder for folder in path.absolute().parents if folder.exists())
-    require(above.is_dir(), f"{path}: {above} is a file, not a folder; choose another place")
-    require(os.access(above, os.W_OK | os.X_OK), f"{path}: nothing can be written in {above}; choose another place")
+    if not above.is_dir():
+        raise UserError(f"{path}: {above} is a file, not a folder; choose another place")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{path}: nothing can be written in {above}; choose another place")
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -113,12 +115,13 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
 
     Without it a .mp4 becomes the .gif of the same name, and the reason says so in one line; else it is empty.
     """
-    path, pictures, reason = Path(path), [to_uint8(frame) for frame in frames], ""
-    suffix = path.suffix.lower()
-    require(suffix in (".gif", ".mp4"), f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
-    found = f"{len(frames)} frames at {fps} fps"
-    require(len(frames) > 0 and fps > 0, f"{path}: a turntable needs frames and a positive rate, got {found}")
-    if suffix == ".mp4":
+    path = Path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise UserError(f"{path}: a turntable is a .gif or .mp4 file, not {path.suffix!r}")
+    if not frames or not fps > 0:
+        raise UserError(f"{path}: a turntable needs frames and a positive rate, got {len(frames)} frames at {fps} fps")
+    pictures, reason = [to_uint8(frame) for frame in frames], ""
+    if path.suffix.lower() == ".mp4":
         try:
             _write_mp4(path, pictures, fps)
             return path, ""
@@ -138,14 +141,9 @@ def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
     images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
-    how: dict[str, Any] = {
-        "save_all": True,
-        "append_images": images[1:],
-        "duration": milliseconds,
-        "loop": 0,
-        "optimize": False,
-    }
-    images[0].save(stream, "gif", **how)
+    images[0].save(
+        stream, "gif", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=False
+    )
     return stream.getvalue()
 
 
@@ -168,9 +166,12 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
 
 def template(path: Path) -> Template:
     """The template of a page in a file; a name that it uses and is not given is an error."""
-    loader = FileSystemLoader([path.parent, Path(__file__).parent])
     return Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader([path.parent, Path(__file__).parent]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     ).get_template(path.name)
 
 
@@ -187,21 +188,22 @@ def read_light(source: Path | str, normalise: bool = True) -> Light:
 
 def read_envmap(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Linear radiance of a latitude-longitude map; ValueError names the file and what is wrong with it."""
-    named, size = ", ".join(NAMES), path.stat().st_size if path.is_file() else 0
-    require(path.is_file(), f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {named}")
-    suits = path.suffix.lower() in ENDINGS
-    require(suits, f"{path}: no map of radiance, which is .hdr or .exr; 8-bit pictures have no bright lamps")
-    too_large = f"{size / 2**20:.0f} MB, more than {MOST_BYTES >> 20}; a map of 1024 x 512 texels is enough"
-    require(size <= MOST_BYTES, f"{path}: {too_large}")
-    installed = find_spec("mitsuba") is not None
-    require(installed, f"{path}: maps are read by the package mitsuba; pip install 'spnr-jax[data]'")
+    if not path.is_file():
+        known = ", ".join(NAMES)
+        raise UserError(f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {known}")
+    if path.suffix.lower() not in ENDINGS:
+        raise UserError(f"{path}: no map of radiance, which is .hdr or .exr; 8-bit pictures have no bright lamps")
+    if path.stat().st_size > MOST_BYTES:
+        size = path.stat().st_size / 2**20
+        raise UserError(f"{path}: {size:.0f} MB, more than {MOST_BYTES >> 20}; a map of 1024 x 512 texels is enough")
+    if find_spec("mitsuba") is None:
+        raise UserError(f"{path}: maps are read by the package mitsuba; pip install 'spnr-jax[data]'")
     radiance = _read_bitmap(path)
-    height, width, _ = radiance.shape
-    require(
-        width == 2 * height, f"{path}: {width} x {height} texels; a latitude-longitude map is twice as wide as high"
-    )
-    lit = np.isfinite(radiance).all() and radiance.min() >= 0 and radiance.max() > 0
-    require(bool(lit), f"{path}: expected finite radiance >= 0 with some light in it")
+    height, width = radiance.shape[:2]
+    if width != 2 * height:
+        raise UserError(f"{path}: {width} x {height} texels; a latitude-longitude map is twice as wide as high")
+    if not np.isfinite(radiance).all() or radiance.min() < 0 or radiance.max() <= 0:
+        raise UserError(f"{path}: expected finite radiance >= 0 with some light in it")
     return radiance
 
 

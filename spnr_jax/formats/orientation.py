@@ -88,7 +88,10 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
         return None
     place = np.array(header.sensor)
     if header.organised or _from_there(positions, place, OPEN):
-        return Sensor(place, _up_of_image(positions - place))
+        # a depth image is in its camera's axes, which are y down looking along z or y up looking against it
+        way = np.median(positions - place, axis=0)
+        ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
+        return Sensor(place, None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y")
     if place.any():
         if _from_there(positions, place, MOST, within=True):
             return Sensor(place)
@@ -109,16 +112,6 @@ def _camera_of(path: Path) -> Sensor | None:
     if not (np.isfinite(above).all() and above.any()):
         return Sensor(place)
     return Sensor(place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)))
-
-
-def _up_of_image(ways: np.ndarray) -> str | None:
-    """The upward axis of a depth image of points that lie these ways (n, 3) from its camera, None if it was none.
-
-    It is in the camera's axes, which are y down looking along z or y up looking against it.
-    """
-    way = np.median(ways, axis=0)
-    ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
-    return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:

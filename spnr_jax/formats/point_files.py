@@ -1,12 +1,7 @@
 """Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-    .ply                        spnr_jax/formats/row_files.py, also 3D Gaussian splats
-    .xyz .txt .csv .asc .pts    spnr_jax/formats/point_tables.py
-    .pcd                        spnr_jax/formats/row_files.py
-    .npz .npy                   spnr_jax/formats/point_tables.py
-    .las .laz                   spnr_jax/formats/las.py
-    .spz                        spnr_jax/formats/gaussian_files.py
-    .glb .gltf .obj .off        meshes (spnr_jax/formats/meshes.py), as points where they have no faces
+READERS says which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz .npy),
+las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
 may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
@@ -95,7 +90,10 @@ def kind_of(path: Path) -> str:
         return kind
     for sign, (name, version, convert) in FOREIGN.items():
         if sign == suffix if isinstance(sign, str) else head.startswith(sign):
-            raise UserError(f"{path}: {name}{_version(head, version)}, which is not read: {convert}")
+            found = struct.unpack_from(version, head) if version and len(head) >= struct.calcsize(version) else ()
+            words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
+            of_version = f" of version {'.'.join(words)}" if words else ""
+            raise UserError(f"{path}: {name}{of_version}, which is not read: {convert}")
     kind = _told_kind(TEXTS, head, suffix) or suffix
     if kind not in KNOWN:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; {known}")
@@ -106,15 +104,6 @@ def _told_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suff
     """The kind that the first bytes of a file tell; empty if they tell none."""
     kinds = next((kinds for sign, kinds in signs if re.match(sign, head)), ("",))
     return suffix if suffix in kinds else kinds[0]
-
-
-def _version(head: bytes, form: str | None) -> str:
-    """The version that stands in the first bytes of a file: text, or numbers."""
-    if form is None or len(head) < struct.calcsize(form):
-        return ""
-    found = struct.unpack_from(form, head)
-    words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
-    return f" of version {'.'.join(words)}"
 
 
 def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:

@@ -63,7 +63,12 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
         layout, words = _layout(properties, lengths)
         wanted = min(count - done, PIECE_LINES if text or lists else max(1, PIECE_BYTES // max(1, layout.itemsize)))
         try:
-            rows = _equal_rows(file, wanted, layout, words if text else 0, done, count)
+            lines = list(enumerate(islice(_lines(file), wanted), done)) if text else []
+            data = b"" if text else file.read(wanted * layout.itemsize)
+            held = done + (len(lines) if text else len(data) // max(1, layout.itemsize))
+            if held < done + wanted:
+                raise UserError(f"is cut off: its header announces {count} points, the data ends after {held}")
+            rows = load_text(lines, "point", words, dtype=layout, ndmin=1) if text else np.frombuffer(data, layout)
             found = {name: rows[f"{name} length"].astype(np.int64) for name in lists}
             if any((found[name] != length).any() for name, length in lengths.items()):
                 raise UserError("has lists of several lengths")
@@ -89,16 +94,6 @@ def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, 
         if width:  # NumPy reads no field of no numbers from text
             fields.append((name, kind, *([(width,)] if width > 1 else [])))
     return np.dtype(fields), sum(math.prod(field[2]) if len(field) > 2 else 1 for field in fields)
-
-
-def _equal_rows(file: BufferedIOBase, wanted: int, layout: np.dtype, words: int, before: int, count: int) -> np.ndarray:
-    """The next rows, of words of text or of bytes if there are none; ValueError where they have not this layout."""
-    lines = list(enumerate(islice(_lines(file), wanted), before)) if words else []
-    data = b"" if words else file.read(wanted * layout.itemsize)
-    held = len(lines) if words else len(data) // max(1, layout.itemsize)
-    if held < wanted:
-        raise UserError(f"is cut off: its header announces {count} points, the data ends after {before + held}")
-    return load_text(lines, "point", words, dtype=layout, ndmin=1) if words else np.frombuffer(data, layout)
 
 
 def _any_rows(
