@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spnr_jax.errors import UserError, refusing
+from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.point_tables import load_text
 
@@ -115,8 +115,10 @@ def _any_rows(
     def join(parts: list, kind: str) -> np.ndarray:
         if not text:
             return np.frombuffer(b"".join(parts), kind)
-        with refusing(f"has up to row {row} of a PLY element other things than numbers"):
+        try:
             return np.array(list(chain(*parts)), str).astype(kind)
+        except (ValueError, OverflowError):
+            raise UserError(f"has other things than numbers in a PLY element, up to its row {row}") from None
 
     for row in range(before, before + count):
         words = next(lines, "").split() if text else words
@@ -293,7 +295,7 @@ def _packed_columns(body: bytes, header: PcdHeader) -> Columns:
     for field in header.properties:
         columns |= join_pieces(found for found, _ in read_rows(stream, header.num_points, [field], text=False))
     if stream.read(1):
-        raise UserError(f"announces {plain} bytes of points, its header fewer")
+        raise UserError(f"announces {plain} bytes of points, more than its header")
     return columns
 
 
