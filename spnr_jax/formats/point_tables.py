@@ -114,7 +114,10 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
             raise ValueError
         return table
 
-    texts = [UNDEFINED.sub("nan", text) if "#" in text or "(" in text else text for _, text in rows]
+    texts = [text for _, text in rows]
+    with contextlib.suppress(ValueError):
+        return load(texts)
+    texts = [UNDEFINED.sub("nan", text) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)
     for (number, text), plain in zip(rows, texts, strict=True):
