@@ -9,7 +9,7 @@ from PIL import Image
 from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder
 
 from data_gen.plan.sources import find_meshes
-from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.errors import UserError
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
@@ -80,7 +80,7 @@ def test_each_hard_file_is_read_or_refused_with_the_right_reason():
     assert len(found) == 10
     for name, path in found.items():
         if name in REFUSED:
-            with pytest.raises(RejectedAsset, match=REFUSED[name]):
+            with pytest.raises(UserError, match=REFUSED[name]):
                 load_mesh(path)
             continue
         points = sample_surface(normalise(load_mesh(path))[0], 256, 0)
@@ -182,7 +182,7 @@ def test_what_lets_light_through_is_drawn_cut_out_or_left_out_and_said(tmp_path,
     assert asset.notes == ((note,) if note else ())
     assert share_of_tested(asset, "even")[0] > 0 or share == NONE
     if note or writer is gltf:
-        with pytest.raises(RejectedAsset, match="is transparent: material 'leaf'"):
+        with pytest.raises(UserError, match="is transparent: material 'leaf'"):
             load_mesh(path)
 
 
@@ -190,7 +190,7 @@ def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     builder = GltfBuilder()
     material = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0]})
     builder.mesh(builder.primitive(material=material))
-    with pytest.raises(RejectedAsset, match="has nothing to draw: transparent parts left out .* 'glass'"):
+    with pytest.raises(UserError, match="has nothing to draw: transparent parts left out .* 'glass'"):
         load_mesh(builder.write(tmp_path / "glass.glb"), transparent_parts="skip")
     nearly = half_transparent(0, 0)
     nearly[0, 0, 3] = 255
@@ -199,7 +199,7 @@ def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     holes = builder.material(alphaMode="MASK", pbrMetallicRoughness=pbr)
     builder.mesh(builder.primitive(material=holes, TEXCOORD_0=UV / 4 + 0.5))
     asset = load_mesh(builder.write(tmp_path / "holes.glb"), transparent_parts="opaque")
-    with pytest.raises(RejectedAsset, match="next to no surface"):
+    with pytest.raises(UserError, match="next to no surface"):
         sample_surface(asset, 20, 0)
 
 
@@ -222,5 +222,5 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
     assert "names a file that is missing: 'look.mtl'" in asset.notes[0]
     assert "uses a material that no library defines: 'leaf', 'plain'" in asset.notes[1]
     for path, name in ((bare, "maps/color.png"), (wood, "look.mtl")):
-        with pytest.raises(RejectedAsset, match=f"missing: '{name}'"):
+        with pytest.raises(UserError, match=f"missing: '{name}'"):
             load_mesh(path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.gltf_files import png
 
-from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.meshes import load_mesh
 
@@ -111,6 +111,6 @@ PAINTED = f"{SQUARE}usemtl paint\nf 1 2 3\n"
     ],
 )  # fmt: skip
 def test_what_is_transparent_missing_or_broken_is_refused_in_one_line(tmp_path, text, mtl, words):
-    with pytest.raises(RejectedAsset, match=words) as caught:
+    with pytest.raises(UserError, match=words) as caught:
         load(tmp_path, text, mtl)
     assert "\n" not in str(caught.value)

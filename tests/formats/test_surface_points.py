@@ -10,7 +10,7 @@ from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
 from support.handmade import plain
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.assets import Asset, Part, lookup, read_image, shrink, value_texels
+from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface, tilt_normals
 
@@ -168,9 +168,9 @@ def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
 
 
 def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
-    texels = np.random.default_rng(0).random((2048, 6, 3), dtype=np.float32)
-    expected = texels.reshape(1024, 2, 3, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(shrink(texels), expected, atol=1e-6)
+    texels = np.random.default_rng(0).integers(0, 256, (2048, 6, 3), dtype=np.uint8)
+    expected = (texels / 255).reshape(1024, 2, 3, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(decode_texels(texels), expected, atol=1e-6)
 
 
 def test_sixteen_bit_grey_images_are_scaled_not_clipped():
@@ -178,4 +178,4 @@ def test_sixteen_bit_grey_images_are_scaled_not_clipped():
     assert read_image(stream, "black").tolist() == [[[0, 0, 0, 255]]]
     stream = io.BytesIO()
     Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
-    assert value_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
+    assert decode_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
