@@ -6,17 +6,12 @@ Conventions, fixed here and nowhere else:
   textures    rows of texels; texture coordinate (u, v) = (0, 0) is the outer corner of texel [0, 0], v runs down the
               rows (as in glTF; mitsuba's `bitmap` reads the same way); at most MAX_SIZE a side, box-filtered to that
   faces       counted through all parts of an object in order: global face = faces of the parts before + local face
-The renderer (what the network is shown) and the point sampler (what it is told) read the same records.  Cut-outs and
-normal maps, which only a picture of points needs, never reach the renderer.
 
-A file may leave open what is to be seen: parts that light passes through, and files that it names and that are missing.
-Where references are made (`refuse`) both are reasons to reject an object.  For a picture:
-  MASK            there is surface where alpha reaches the cut-off of the file, and none elsewhere
-  BLEND and the like, transmission
-      opaque      drawn in their colour; texels that are all but invisible beside the most visible one are no surface
-      skip        there is surface where alpha is at least a half; a part that transmits light is left out
-  missing images  plain values of a stand-in
-A part whose alpha is 1 everywhere is opaque, whatever its file calls it.
+Parts that light passes through, and files that are named and missing, are reasons to reject an object where references
+are made (`refuse`).  For a picture, a missing image leaves plain values, and of what is not opaque everywhere
+  MASK                  is surface where alpha reaches the cut-off of the file
+  BLEND, transmission   opaque: is drawn, but for texels that are all but invisible beside the most visible one
+                        skip: is surface where alpha is at least a half; a part that transmits light is left out
 """
 
 import base64

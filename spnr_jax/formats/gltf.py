@@ -1,24 +1,20 @@
-"""glTF 2.0 scenes, .gltf or .glb, as raw assets: one part per primitive of a node, transforms applied from the root.
+"""glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node, in its rest pose.
 
 Read here and not through trimesh 5.2, whose reader leaves normalised integers unscaled, drops triangle fans, and shows
 a compressed file as vertices at the origin; tests compare the rest with trimesh.  DracoPy (KHR_draco_mesh_compression)
-and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.  The rest pose is read.
+and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
-reference converter. Where a picture is wanted and no reference (assets.py), alpha says where there is surface, and
-the normal map is kept. A material has one set of coordinates, that of the first texture that is read
-(KHR_texture_transform, texCoord, sampler); another texture that lies differently is replaced by its mean.
-
-What is not modelled is named in `ignored`; an extension that the file requires and that is not known here rejects the
-object.
+reference converter.  A material has one set of coordinates, that of the first texture that is read; another texture
+that lies differently is replaced by its mean.  What is not modelled is named in `ignored`.
 """
 
 import json
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,9 +52,10 @@ DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 # texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
-# of a workflow: its textures of colour and of what reflects, what stands in for the latter, and the factor of colour
-ROUGH = "baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"
-GLOSSY = "diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"
+WORKFLOWS = (  # textures of colour and of reflection, a stand-in for the latter, factor of colour
+    ("baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"),
+    ("diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"),
+)
 # Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
 # costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
@@ -76,7 +73,7 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
     ignored |= {key for key in ("animations", "skins") if document.get(key)}
     ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
-    looks: dict[int | None, tuple[Material | None, Placement]] = {}
+    read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
     for primitive, matrix in drawn:
@@ -86,9 +83,7 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
         ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
         ignored |= {"morph targets"} if primitive.get("targets") else set()
         number, key = primitive.get("material"), id(primitive)
-        if number not in looks:
-            looks[number] = read_material(file, number)
-        material, placement = looks[number]
+        material, placement = read_look(number)
         if material is None:
             continue
         if key in shapes:
@@ -157,11 +152,11 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     order = np.arange(len(columns["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
-    if mode == "TRIANGLES":
-        return columns, order[: len(order) // 3 * 3].reshape(-1, 3)
     if mode == "TRIANGLE_STRIP":
         return columns, strip_faces(order)
-    return columns, np.stack([order[1:-1], order[2:], np.repeat(order[:1], max(0, len(order) - 2))], axis=-1)
+    if mode == "TRIANGLE_FAN":
+        return columns, np.stack([order[1:-1], order[2:], np.repeat(order[:1], max(0, len(order) - 2))], axis=-1)
+    return columns, order[: len(order) // 3 * 3].reshape(-1, 3)
 
 
 def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Placement", matrix: np.ndarray) -> Part:
@@ -189,8 +184,6 @@ class GltfFile:
 
     def __init__(self, path: Path, loading: Loading):
         self.loading, data = loading, path.read_bytes()
-        text: bytes
-        self._binary: bytes | None
         text, self._binary = _split_glb(data) if data[:4] == b"glTF" else (data, None)
         try:
             self.document = json.loads(text.decode("utf-8-sig"))
@@ -199,7 +192,8 @@ class GltfFile:
         version = str(self.document.get("asset", {}).get("version", "1.0"))
         if not version.startswith("2."):
             raise UserError(f"is glTF {version}; only glTF 2.0 can be read: convert it")
-        self._buffer, self.view = cache(self._read_buffer), cache(self._read_view)
+        self._buffers: dict[int, bytes] = {}
+        self._views: dict[int, memoryview] = {}
         self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
 
     def columns(self, attributes: dict[str, int], *names: str) -> Columns:
@@ -232,25 +226,27 @@ class GltfFile:
             raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
         return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
 
-    def _read_view(self, index: int) -> memoryview:
+    def view(self, index: int) -> memoryview:
         """What a buffer view holds."""
-        view = self.document["bufferViews"][index]
-        packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
-        return self._slice(view) if packed is None else memoryview(unpack(self._slice(packed), packed))
+        if index not in self._views:
+            view = self.document["bufferViews"][index]
+            packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
+            data = self._slice(packed or view)
+            self._views[index] = memoryview(unpack(data, packed)) if packed else data
+        return self._views[index]
 
     def _slice(self, view: dict) -> memoryview:
-        start, number = view.get("byteOffset", 0), view["buffer"]
-        buffer, end = self._buffer(number), start + view["byteLength"]
+        start, length, number = view.get("byteOffset", 0), view["byteLength"], view["buffer"]
+        if number not in self._buffers:
+            uri = self.document["buffers"][number].get("uri")
+            data = self._binary if uri is None else self.loading.read(uri, needed=True)
+            if data is None:
+                raise UserError(f"buffer {number} has no data in the file")
+            self._buffers[number] = data
+        buffer, end = self._buffers[number], start + length
         if not 0 <= start <= end <= len(buffer):
             raise UserError(f"buffer {number} has {len(buffer)} bytes where {end} are needed: truncated file")
         return memoryview(buffer)[start:end]
-
-    def _read_buffer(self, number: int) -> bytes:
-        uri = self.document["buffers"][number].get("uri")
-        data = self._binary if uri is None else self.loading.read(uri, needed=True)
-        if data is None:
-            raise UserError(f"buffer {number} has no data in the file")
-        return data
 
     def unpack_mesh(self, primitive: dict) -> None:
         """Makes ready what a primitive keeps in a Draco mesh; whole numbers are as they were before, not normalised.
@@ -258,8 +254,9 @@ class GltfFile:
         The library holds what a mesh announces against the size of its data before it makes room for it.
         """
         draco, packed = assets.extra("DracoPy"), primitive["extensions"][DRACO]
+        data = bytes(self.view(packed["bufferView"]))
         try:
-            mesh = draco.decode(bytes(self.view(packed["bufferView"])))
+            mesh = draco.decode(data)
         except (draco.FileTypeException, ValueError, RuntimeError, MemoryError) as error:
             raise UserError(f"holds a Draco mesh that is broken or cut off ({error})") from None
         if getattr(mesh, "faces", None) is None:
@@ -272,7 +269,7 @@ class GltfFile:
         self._unpacked[primitive["indices"]] = np.asarray(mesh.faces).reshape(-1, 1)
 
 
-def _split_glb(data: bytes) -> tuple[bytes, bytes]:
+def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
     """JSON text and binary chunk of a GLB file."""
     version, length, size, kind = struct.unpack_from("<4I", data.ljust(20, b"\0"), 4)
     if version != 2:
@@ -315,71 +312,70 @@ class Placement(NamedTuple):
     offset: tuple = (0.0, 0.0)
 
 
-class Textures:
-    """Reads a material's textures; `place` says where the first lies."""
+def _read_texture(
+    file: GltfFile, places: list[Placement], info: dict | None, stand_in: tuple[int, ...]
+) -> np.ndarray | None:
+    """Encoded texels (h, w, 4) of a textureInfo, or of the stand-in (4,) where its image may be missing.
 
-    def __init__(self, file: GltfFile, name: str):
-        self.file, self.name, self.ignored = file, name, file.loading.ignored
-        self.place: Placement | None = None
+    Where it lies is added to the material's `places`; of a texture that lies differently from the first the mean is
+    taken, (1, 1, 4).
+    """
+    if info is None:
+        return None
+    texture = file.document["textures"][info["index"]]
+    texels = _read_image(file, texture)
+    texels = np.array(stand_in, np.uint8).reshape(1, 1, 4) if texels is None else texels
+    places.append(_placement(file, info, texture))
+    if places[-1] == places[0]:
+        return texels
+    file.loading.ignored.add("second texture with its own coordinates (its mean is used)")
+    return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
 
-    def read(self, info: dict | None, stand_in: tuple[int, ...]) -> np.ndarray | None:
-        """Encoded texels (h, w, 4) of a textureInfo, or of the stand-in (4,) where its image may be missing.
 
-        The texels' mean (1, 1, 4) takes the place of a texture that lies differently from the first.
-        """
-        if info is None:
-            return None
-        texture = self.file.document["textures"][info["index"]]
-        texels = self._image(texture)
-        texels = np.array(stand_in, np.uint8).reshape(1, 1, 4) if texels is None else texels
-        place = self._placement(info, texture)
-        self.place = self.place or place
-        if place == self.place:
-            return texels
-        self.ignored.add("second texture with its own coordinates (its mean is used)")
-        return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
+def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
+    """Texels (h, w, 4) of a texture; None where its image is missing."""
+    extensions = texture.get("extensions", {})
+    webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
+    source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
+    if source is None:
+        raise UserError(f"has a texture that cannot be read: {', '.join(extensions) or 'no image'}")
+    image = file.document["images"][source]
+    if "uri" in image:
+        return file.loading.read_image(image["uri"])
+    return assets.read_image(bytes(file.view(image["bufferView"])), f"image {source}")
 
-    def _image(self, texture: dict) -> np.ndarray | None:
-        extensions = texture.get("extensions", {})
-        webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
-        source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
-        if source is None:
-            formats = ", ".join(extensions) or "no image"
-            raise UserError(f"material {self.name!r} has a texture that cannot be read: {formats}")
-        image = self.file.document["images"][source]
-        if "uri" in image:
-            return self.file.loading.read_image(image["uri"])
-        return assets.read_image(bytes(self.file.view(image["bufferView"])), f"image {source}")
 
-    def _placement(self, info: dict[str, Any], texture: dict) -> Placement:
-        """Where a texture lies.
+def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:
+    """Where a texture lies.
 
-        Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its
-        GLSL snippet turns the other way).
-        """
-        sampler = self.file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
-        if wrap != wrap_t:
-            self.ignored.add(f"wrapT {wrap_t} (wrapS {wrap} is used for both)")
-        if sampler.get("magFilter") == NEAREST:
-            self.ignored.add("nearest-texel filter (bilinear is used)")
-        moved = info.get("extensions", {}).get(MOVED, {})
-        cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
-        turn = np.array([[cos, sin], [-sin, cos]]) * np.asarray(moved.get("scale", (1, 1)), np.float64)
-        x, y = moved.get("offset", (0, 0))
-        number = moved.get("texCoord", info.get("texCoord", 0))
-        return Placement(wrap, number, tuple(map(tuple, turn.tolist())), (float(x), float(y)))
+    Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its GLSL
+    snippet turns the other way).
+    """
+    sampler = file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
+    if wrap != wrap_t:
+        file.loading.ignored.add(f"wrapT {wrap_t} (wrapS {wrap} is used for both)")
+    if sampler.get("magFilter") == NEAREST:
+        file.loading.ignored.add("nearest-texel filter (bilinear is used)")
+    moved = info.get("extensions", {}).get(MOVED, {})
+    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
+    turn = np.array([[cos, sin], [-sin, cos]]) * np.asarray(moved.get("scale", (1, 1)), np.float64)
+    x, y = moved.get("offset", (0, 0))
+    number = moved.get("texCoord", info.get("texCoord", 0))
+    return Placement(wrap, number, tuple(map(tuple, turn.tolist())), (float(x), float(y)))
 
 
 def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
     """The material `index` of a file (None: glTF's default), None if it is nowhere seen, and where its textures lie."""
     spec = {} if index is None else file.document["materials"][index]
     name, extensions, loading = str(spec.get("name", f"number {index}")), spec.get("extensions", {}), file.loading
-    textures = Textures(file, name)
+    places: list[Placement] = []
+    read = partial(_read_texture, file, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
-    names, look = (ROUGH, spec.get("pbrMetallicRoughness", {})) if glossy is None else (GLOSSY, glossy)
-    color, surface = textures.read(look.get(names[0]), GREY), textures.read(look.get(names[1]), names[2])
-    factor = np.asarray(look.get(names[3], (1, 1, 1, 1)), np.float64)
+    look = spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy
+    of_color, of_surface, stand_in, of_factor = WORKFLOWS[glossy is not None]
+    color, surface = read(look.get(of_color), GREY), read(look.get(of_surface), stand_in)
+    factor = np.asarray(look.get(of_factor, (1, 1, 1, 1)), np.float64)
     base_color = factor[:3] if color is None else decode_texels(color[..., :3], SRGB_TABLE) * factor[:3]
     channels = (_roughness if glossy is None else _glossiness)(look, base_color, surface)
     # after the textures: a missing file is the plainer reason
@@ -392,10 +388,10 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     loading.ignored |= {"emissive"} if any(spec.get("emissiveFactor", ())) else set()
     if loading.strict:
         loading.ignored |= spec.keys() & {"normalTexture"}
-    elif (bumps := textures.read(spec.get("normalTexture"), FLAT)) is not None and material is not None:
+    elif (bumps := read(spec.get("normalTexture"), FLAT)) is not None and material is not None:
         scale = np.array([float(spec["normalTexture"].get("scale", 1.0))] * 2 + [1], np.float32)
         material = replace(material, normal_map=decode_texels(bumps[..., :3], DIRECTIONS) * scale)
-    placement = textures.place or Placement()
+    placement = [*places, Placement()][0]
     return material and replace(material, wrap=placement.wrap), placement
 
 

@@ -1,7 +1,4 @@
-"""Mesh files as assets: read, checked, cleaned and merged by material.
-
-glTF and GLB carry principled materials (gltf.py), OBJ gets them from its MTL (obj.py); PLY, STL and OFF (polygons.py)
-have vertex or face colours at most, read as those of points are (columns.py), grey 0.5 otherwise.
+"""Mesh files as assets: read (gltf.py, obj.py, polygons.py), checked, cleaned and merged by material.
 
 checked   indices inside, coordinates finite, an extent above zero
 cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone

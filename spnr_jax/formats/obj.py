@@ -1,10 +1,8 @@
-"""Wavefront OBJ + MTL as raw assets.
+"""Wavefront OBJ + MTL as parts; vertex colours are read as those of points are (columns.py).
 
-Vertices with the same position, texture coordinates and normal are one.  Vertex colours are read as those of points are
-(columns.py). Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a
-placeholder beside a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0. Transparent: d
-below 1, map_d, or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one); where a picture is
-wanted (assets.py) map_d is a cut-out at a half, and a library or an image that is missing leaves grey. Of faces with
+Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
+a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (a
+cut-out at a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with
 the same three corners, in either order, one is kept, that of the material used first: ShapeNet has many, one for each
 side, and a ray could not tell which it hits.
 """

@@ -1,4 +1,4 @@
-"""PLY, STL and OFF files of triangles and polygons as raw assets: no materials, colours of vertices or faces at most.
+"""PLY, STL and OFF files of triangles and polygons as parts: no materials, colours of vertices or faces at most.
 
 Polygons become fans of triangles, or ears (Meisters 1975) where a fan would cover a notch.
 

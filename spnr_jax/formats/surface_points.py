@@ -1,9 +1,7 @@
 """Surface points with materials: normalisation of an object, and samples of its surface.
 
-Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
-those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and multiplied by
-the interpolated vertex colour; those that it cuts out are replaced.  `face` counts through all parts, as the renderer
-reports its hits.
+Points are drawn uniformly by area over all parts, or spread evenly.  The material of each is looked up with the
+interpolation of the renderer and multiplied by the interpolated vertex colour; points that it cuts out are replaced.
 
 A texel of a normal map says where the normal points along the directions in which u grows, in which v falls (v runs
 down the rows, and the map's green is up), and outwards.  On a triangle the position is linear in the texture
