@@ -10,6 +10,7 @@ from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
 from support.handmade import plain
 
 from data_gen.render.variant import mitsuba_module
+from data_gen.render.views import bitmap_texture
 from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface, tilt_normals
@@ -48,16 +49,10 @@ def test_points_are_uniform_by_area_on_the_faces_that_they_name():
 
 
 def test_the_material_is_looked_up_where_the_point_lies():
-    ramp = np.linspace(0, 1, 64, dtype=np.float32)  # value of texel centre i is i / 63
-    look = plain(
-        color=np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.ones((64, 64))], axis=-1),
-        roughness=np.tile(1 - ramp[:, None], (1, 2)),
-        metallic=0.25,
-    )
+    ramp = np.tile(np.linspace(0, 1, 64, dtype=np.float32), (64, 1))  # value of texel centre i is i / 63
+    look = plain(color=np.stack([ramp, ramp.T, np.ones((64, 64))], axis=-1), roughness=1 - ramp.T[:, :2], metallic=0.25)
     tint = np.tile([0.5, 1.0, 0.5], (4, 1))
-    part = square(
-        look=replace(look, wrap="clamp"), texcoords=np.stack([CORNERS[:, 0], 1 - CORNERS[:, 1]], axis=-1), colors=tint
-    )
+    part = square(look=replace(look, wrap="clamp"), texcoords=UV.astype(float), colors=tint)
     points = sample_surface(Asset(parts=(part,)), 1000, 3)
     u, v = points.positions[:, 0], 1 - points.positions[:, 1]
 
@@ -99,15 +94,15 @@ def bumpy_normals(tmp_path, normal, uv=UV, transform=None, **attributes):
     return sample_surface(asset, 10, 0).normals
 
 
-@pytest.mark.parametrize(
-    ("uv", "of_red", "of_green"),
-    [
-        (UV, X, Y),  # red tilts along u, green up the picture
-        (UV[:, ::-1], -Y, -X),  # transposed: a quarter turn and a mirror
-        (UV * [-1, 1], X * [-1, 1, 1], Y),  # mirrored in u alone
-        (1 - UV, X * [-1, 1, 1], Y * [1, -1, 1]),  # half a turn
-    ],
-)
+TURNS = [  # coordinates; what red, which tilts along u, and green, up the picture, become
+    (UV, X, Y),
+    (UV[:, ::-1], -Y, -X),  # transposed: a quarter turn and a mirror
+    (UV * [-1, 1], X * [-1, 1, 1], Y),  # mirrored in u alone
+    (1 - UV, X * [-1, 1, 1], Y * [1, -1, 1]),  # half a turn
+]
+
+
+@pytest.mark.parametrize(("uv", "of_red", "of_green"), TURNS)
 def test_a_normal_map_tilts_along_the_coordinates_however_they_are_turned(tmp_path, uv, of_red, of_green):
     for normal, (x, y, _) in ((RED, of_red), (GREEN, of_green)):
         np.testing.assert_allclose(bumpy_normals(tmp_path, normal, uv.astype("f4")), [[x, y, 0.8]] * 10, atol=0.01)
@@ -155,10 +150,7 @@ def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
     rng = np.random.default_rng(3)
     texels = rng.random(shape, dtype=np.float32)
     texcoords = rng.uniform(-2.5, 3.5, (200, 2)).astype(np.float32)
-    bitmap = mi.Bitmap(texels if len(shape) == 3 else texels[..., None])
-    texture = mi.load_dict(
-        {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": wrap}
-    )
+    texture = mi.load_dict(bitmap_texture(texels if len(shape) == 3 else texels[..., None], wrap))
     hit = mi.SurfaceInteraction3f()
     expected = []
     for u, v in texcoords.tolist():

@@ -35,6 +35,27 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(options, exp
         assert message.count("\n") == 1
 
 
+def ids(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return {identifier: str(path.relative_to(folder)) for identifier, path in sources.find_meshes(folder)}
+
+
+def test_ids_are_stems_or_the_folder_of_a_lone_obj_or_gltf(tmp_path):
+    found = ids(tmp_path, "b.glb", "a.PLY", "pan/model.obj", "pan/model.mtl", "lamp/scene.gltf", "x/cup.glb")
+    expected = {"a": "a.PLY", "b": "b.glb", "cup": "x/cup.glb", "lamp": "lamp/scene.gltf", "pan": "pan/model.obj"}
+    assert list(found.items()) == list(expected.items())
+
+
+def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(tmp_path):
+    found = ids(tmp_path, "a b.glb", "a_b.glb", "a?b.glb", "A_B.GLB", "ä.off", "ö.off", "a_b.glb.ply")
+    assert len(found) == 7
+    assert len({name.casefold() for name in found}) == 7
+    assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABGLP._-0123456789") for name in found)
+    assert all(name[0] not in "._-" for name in found)
+
+
 # Amazon Berkeley Objects
 
 PRODUCTS = [f"B07{number:06d}{letter}" for number, letter in enumerate("LL91ABC")]
