@@ -108,13 +108,8 @@ class Asset:
     points: Columns | None = None
 
 
-def make_material(
-    base_color: Values | float | int = 0.5,
-    roughness: Values | float | int = 0.5,
-    metallic: Values | float | int = 0.0,
-    wrap: Wrap = "repeat",
-) -> Material:
-    """A material of float32 channels in [0, 1]; grey of roughness 0.5 where nothing is given."""
+def make_material(base_color: Any = 0.5, roughness: Any = 0.5, metallic: Any = 0.0, wrap: Wrap = "repeat") -> Material:
+    """A material of channels, one value or an array each, clipped to [0, 1]; grey of roughness 0.5 by default."""
     color = np.broadcast_to(base_color, (*np.shape(base_color)[:-1], 3))
     channels = [np.asarray(values, np.float32) for values in (color, roughness, metallic)]
     if not all(np.isfinite(values).all() for values in channels):

@@ -23,7 +23,7 @@ from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
+from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
 from spnr_jax.formats.columns import LINEAR, Columns
 from spnr_jax.formats.polygons import strip_faces
 
@@ -39,15 +39,13 @@ READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_l
 DROPPED = {"KHR_lights_punctual", "EXT_mesh_gpu_instancing"}  # of what a scene may use
 SPLATS = "KHR_gaussian_splatting"
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
-TRANSPARENT = {
-    "KHR_materials_transmission": "transmissionFactor",
-    "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
-}
+TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
 FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
     "OCTAHEDRAL": ("decode_filter_oct", (4, 8)),
     "QUATERNION": ("decode_filter_quat", (8,)),
     "EXPONENTIAL": ("decode_filter_exp", range(4, 257, 4)),
 }
+RGB = slice(3)  # of the channels of texels
 DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of a normal map
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 # texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
@@ -375,51 +373,44 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     look = spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy
     of_color, of_surface, stand_in, of_factor = WORKFLOWS[glossy is not None]
     color, surface = read(look.get(of_color), GREY), read(look.get(of_surface), stand_in)
-    factor = np.asarray(look.get(of_factor, (1, 1, 1, 1)), np.float64)
-    base_color = factor[:3] if color is None else decode_texels(color[..., :3], SRGB_TABLE) * factor[:3]
-    channels = (_roughness if glossy is None else _glossiness)(look, base_color, surface)
+    factor = look.get(of_factor, (1, 1, 1, 1))
+    base_color = _scaled(color, RGB, factor[:3], SRGB_TABLE)
+    if glossy is None:
+        metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
+        roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
+    else:
+        specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
+        base_color, metallic = metallic_roughness(base_color, specular)
+        roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
     # after the textures: a missing file is the plainer reason
-    material = loading.cut_out(name, assets.make_material(*channels), *_alpha(spec, factor, color))
+    material = assets.make_material(base_color, roughness, metallic)
+    shown = loading.cut_out(name, material, *_alpha(spec, color, (*factor, 1.0)[3]))
     if UNLIT in extensions:
-        loading.say(
-            "colours that hold light already (KHR_materials_unlit) taken as base colours", about=repr(name[:40])
-        )
+        light = "colours that hold light already (KHR_materials_unlit) taken as base colours"
+        loading.say(light, about=repr(name[: assets.LONGEST_NAME]))
     loading.ignored |= extensions.keys() - {SPECULAR_GLOSSINESS} | (spec.keys() & {"occlusionTexture"})
     loading.ignored |= {"emissive"} if any(spec.get("emissiveFactor", ())) else set()
     if loading.strict:
         loading.ignored |= spec.keys() & {"normalTexture"}
-    elif (bumps := read(spec.get("normalTexture"), FLAT)) is not None and material is not None:
-        scale = np.array([float(spec["normalTexture"].get("scale", 1.0))] * 2 + [1], np.float32)
-        material = replace(material, normal_map=decode_texels(bumps[..., :3], DIRECTIONS) * scale)
+    elif (bumps := read(spec.get("normalTexture"), FLAT)) is not None and shown is not None:
+        scale = float(spec["normalTexture"].get("scale", 1.0))
+        shown = replace(shown, normal_map=_scaled(bumps, RGB, np.array([scale, scale, 1], np.float32), DIRECTIONS))
     placement = [*places, Placement()][0]
-    return material and replace(material, wrap=placement.wrap), placement
+    return shown and replace(shown, wrap=placement.wrap), placement
 
 
-def _roughness(look: dict, base_color: np.ndarray, surface: np.ndarray | None) -> tuple:
-    """Base colour, roughness and metallic of a metallic-roughness material."""
-    roughness, metallic = np.array([look.get(name, 1.0) for name in ("roughnessFactor", "metallicFactor")], np.float64)
-    if surface is not None:
-        roughness = decode_texels(surface[..., 1]) * roughness
-        metallic = metallic if metallic == 0 else decode_texels(surface[..., 2]) * metallic
-    return base_color, roughness, metallic
-
-
-def _glossiness(look: dict, diffuse: np.ndarray, surface: np.ndarray | None) -> tuple:
-    """Base colour, roughness and metallic of a specular-glossiness material."""
-    specular = np.asarray(look.get("specularFactor", (1, 1, 1)), np.float64)
-    glossiness = np.asarray(float(look.get("glossinessFactor", 1)))
-    if surface is not None:
-        specular = decode_texels(surface[..., :3], SRGB_TABLE) * specular
-        glossiness = decode_texels(surface[..., 3]) * glossiness
-    if diffuse.ndim == specular.ndim == 3:
-        height, width = map(max, diffuse.shape[:2], specular.shape[:2])
-        diffuse, specular = assets.resize(diffuse, height, width), assets.resize(specular, height, width)
-    base_color, metallic = metallic_roughness(*np.broadcast_arrays(diffuse, specular))
-    return base_color, 1 - glossiness, metallic
+def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table: np.ndarray = LEVELS) -> np.ndarray:
+    """The factor, times channels of texels (h, w, 4) by a table (256,) where there are some."""
+    factor = np.asarray(factor) if isinstance(factor, np.ndarray) else np.asarray(factor, np.float64)
+    return factor if texels is None or not factor.any() else decode_texels(texels[..., channels], table) * factor
 
 
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours (*n, 3)."""
+    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours, (*n, 3) or images of two sizes."""
+    if diffuse.ndim == specular.ndim == 3:
+        height, width = map(max, diffuse.shape[:2], specular.shape[:2])
+        diffuse, specular = assets.resize(diffuse, height, width), assets.resize(specular, height, width)
+    diffuse, specular = np.broadcast_arrays(diffuse, specular)
     strength = 1 - specular.max(axis=-1)
     bright_diffuse, bright_specular = (np.sqrt((x * x) @ np.array([0.299, 0.587, 0.114])) for x in (diffuse, specular))
     b = bright_diffuse * strength / (1 - DIELECTRIC) + bright_specular - 2 * DIELECTRIC
@@ -432,14 +423,13 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
     return np.clip(base_color, 0, 1), metallic[..., 0]
 
 
-def _alpha(spec: dict, factor: np.ndarray, color: np.ndarray | None) -> tuple[str, np.ndarray, float | None]:
+def _alpha(spec: dict, color: np.ndarray | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:
     """Why a material is said to be transparent ("": it is not), its alpha () or (h, w), and the cut-off of a mask."""
     mode, extensions = spec.get("alphaMode", "OPAQUE"), spec.get("extensions", {})
-    for extension, entry in TRANSPARENT.items():
-        if extensions.get(extension, {}).get(entry, 0) > 0:
-            return extension, np.zeros(()), None
+    for name, entry in TRANSPARENT.items():
+        if extensions.get(f"KHR_materials_{name}", {}).get(entry, 0) > 0:
+            return f"KHR_materials_{name}", np.zeros(()), None
     if mode == "OPAQUE":
         return "", np.ones(()), None
-    alpha = np.asarray(factor[3] if len(factor) > 3 else 1.0)
-    alpha = alpha if color is None else alpha * decode_texels(color[..., 3])
-    return f"alphaMode {mode}", alpha, float(spec.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+    cutoff = float(spec.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+    return f"alphaMode {mode}", _scaled(color, 3, factor), cutoff
