@@ -29,14 +29,14 @@ OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE]
 def load_obj(path: Path, loading: Loading) -> list[Part]:
     """The file's faces grouped by material, as they lie in the file."""
     text = _parse(path.read_text("utf-8-sig", errors="replace"))
-    if not (text["f"] or text["v"]):
+    if not (text["f sizes"] or text["v"]):
         raise UserError("has no faces, and no vertices")
     columns = _columns(text)
-    if not text["f"]:
+    if not text["f sizes"]:
         loading.points = columns
         return []
     library: dict[str, dict[str, str]] = {}
-    for names in text["mtllib"]:  # one name with spaces, or several without
+    for names in map(str.strip, text["mtllib"]):  # one name with spaces, or several without
         single = (loading.folder / names).is_file() or len(names.split()) == 1
         for name in [names] if single else names.split():
             library |= parse_mtl(loading.read(name) or b"")
@@ -54,8 +54,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 
 def _parse(content: str) -> Rests:
-    """The rests of lines by their keyword; of each face its corners, words like 1/2/3 counted from 1, and material."""
-    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "usemtl", "mtllib")}
+    """The rests of lines by their keyword; of faces all corners, words like 1/2/3 from 1, sizes and materials."""
+    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "usemtl", "mtllib")}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     for line in content.replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
@@ -64,12 +64,13 @@ def _parse(content: str) -> Rests:
             if "-" in rest:  # numbers that count back from here
                 pairs = [zip(word.split("/"), counted, strict=False) for word in words]
                 words = ["/".join(str(int(n) + len(x) + 1) if n[:1] == "-" else n for n, x in pair) for pair in pairs]
-            found["f"].append(words)
+            found["f"].extend(words)
+            found["f sizes"].append(len(words))
             found["usemtl"].append(material)
         elif keyword == "usemtl":
             material = rest.strip()
         elif keyword in found:
-            found[keyword].append(rest.strip())
+            found[keyword].append(rest)
     return found
 
 
@@ -86,7 +87,7 @@ def _columns(text: Rests) -> Columns:
     except ValueError:  # rows of different lengths
         table = _table(text["v"], 3)
     columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
-    if not text["f"] and len(text["vn"]) == len(table):
+    if not text["f sizes"] and len(text["vn"]) == len(table):
         columns |= dict(zip(NORMAL, _table(text["vn"], 3).T, strict=True))
     return columns
 
@@ -95,8 +96,7 @@ def _parts(
     text: Rests, positions: np.ndarray, colors: np.ndarray | None, looks: dict[str, Material | None], loading: Loading
 ) -> list[Part]:
     """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
-    words = [word for face in text["f"] for word in face]
-    numbers = {word: i for i, word in enumerate(dict.fromkeys(words))}
+    numbers = {word: i for i, word in enumerate(dict.fromkeys(text["f"]))}
     corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
     if corners.min() < 0 or corners[:, 0].min() < 1:
         raise UserError("has faces that name vertices before the first: broken file")
@@ -107,7 +107,7 @@ def _parts(
     positions, colors = positions[of_v], None if colors is None else colors[of_v]
     texcoords = _table([*text["vt"], "0 0"], 2)[of_vt] * [1, -1] + [0, 1]  # v is from the lower edge
     normals = _table([*text["vn"], "0 0 0"], 3)[of_vn]
-    faces, owner = triangulate(positions, np.array([numbers[word] for word in words]), list(map(len, text["f"])))
+    faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
     number = {name: i for i, name in enumerate(looks)}
     has = (corners[faces] > 0).all(axis=1)  # whether each face has places, texture coordinates, normals
     kind = 4 * np.array([number[name] for name in text["usemtl"]])[owner] + 2 * has[:, 1] + has[:, 2]
