@@ -25,7 +25,7 @@ from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
 from spnr_jax.formats.columns import LINEAR, Columns
-from spnr_jax.formats.polygons import strip_faces
+from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

@@ -21,7 +21,8 @@ from spnr_jax.formats.columns import full_scale
 from spnr_jax.formats.gltf import load_gltf
 from spnr_jax.formats.obj import load_obj
 from spnr_jax.formats.polygons import PLAIN
-from spnr_jax.formats.surface_points import bounding_box, face_areas, face_crosses, unit, vertex_normals
+from spnr_jax.formats.surface_points import bounding_box, face_areas
+from spnr_jax.kernels.triangles import face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14

@@ -16,8 +16,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
-from spnr_jax.formats.polygons import triangulate
 from spnr_jax.kernels.cloud_arrays import stack_columns
+from spnr_jax.kernels.triangles import triangulate
 
 Rests = dict[str, list]
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")

@@ -1,7 +1,5 @@
 """PLY, STL and OFF files of triangles and polygons as parts: no materials, colours of vertices or faces at most.
 
-Polygons become fans of triangles, or ears (Meisters 1975) where a fan would cover a notch.
-
 .ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have
 .stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
         the file counts where the count is 0
@@ -10,7 +8,6 @@ Polygons become fans of triangles, or ears (Meisters 1975) where a fan would cov
 
 import io
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +16,10 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Loading, Part, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.row_files import read_elements, read_ply_header
-from spnr_jax.formats.surface_points import face_crosses
 from spnr_jax.kernels.cloud_arrays import stack_columns
+from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
-MOST_CORNERS = 2048  # of a polygon whose ears are looked for; a larger one becomes a fan
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF\b([^\S\n]*\n)?")
 
@@ -45,15 +41,6 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     if "texcoord" in lists or any(pair <= vertices.keys() for pair in TEXCOORDS):
         loading.ignored.add("texture coordinates (of formats other than glTF and OBJ)")
     return _colored(vertices, corners, sizes, of_faces, loading)
-
-
-def strip_faces(order: np.ndarray) -> np.ndarray:
-    """Triangles (f, 3) of strips of vertices (n,), which -1 ends; every other one of a strip is turned."""
-    number = np.arange(len(order))
-    place = number - np.maximum.accumulate(np.where(order < 0, number + 1, 0))  # in its strip
-    faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
-    faces = np.where(place[: len(faces), None] % 2 == 1, faces[:, [1, 0, 2]], faces)
-    return faces[(faces >= 0).all(axis=1)]
 
 
 def load_stl(path: Path, loading: Loading) -> list[Part]:
@@ -121,61 +108,9 @@ def _colored(
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     colors, notes = colors_of(columns) or (None, [])
     if colors is None and (found := colors_of(rename(of_faces))) is not None:
-        positions, normals, colors, notes = (
-            positions[faces.ravel()],
-            None,
-            np.repeat(found[0][owner], 3, axis=0),
-            found[1],
-        )
+        positions, normals = positions[faces.ravel()], None
+        colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors)]
-
-
-# --- triangles of polygons --------------------------------------------------------------------------------------------
-
-
-def triangulate(
-    positions: np.ndarray, corners: np.ndarray, sizes: Sequence[int] | np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Faces (f, 3) of polygons of so many corners, vertex numbers, in their order, and the polygon that each is of."""
-    count, corners = np.array(sizes, np.int64), corners.astype(np.int64)
-    begin = np.cumsum(count) - count
-    faces, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
-    for size in np.unique(count[count > 2]):
-        rows = np.flatnonzero(count == size)
-        own = corners[begin[rows, None] + np.arange(size)]
-        fan = np.stack([np.broadcast_to(own[:, :1], (len(rows), size - 2)), own[:, 1:-1], own[:, 2:]], axis=-1)
-        if 3 < size <= MOST_CORNERS and (own >= 0).all() and own.max() < len(positions):
-            crosses = face_crosses(positions, fan.reshape(-1, 3)).reshape(fan.shape)
-            share = np.einsum("mnc,mc->mn", crosses, crosses.sum(axis=1))
-            turned = share < -1e-9 * np.abs(share).max(axis=1)[:, None]  # against the sense of the whole
-            for row in np.flatnonzero(turned.any(axis=1)):
-                fan[row] = own[row][ears(positions[own[row]])]
-        faces.append(fan.reshape(-1, 3))
-        owners.append(np.repeat(rows, size - 2))
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(faces)[order], owner[order]
-
-
-def ears(corners: np.ndarray) -> np.ndarray:
-    """Triangles (n - 2, 3) of a simple polygon (n, 3), as numbers of its corners; a fan of what is not simple."""
-    centred = corners - corners.mean(axis=0)
-    normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
-    axis = int(np.abs(normal).argmax())
-    flat = np.roll(centred, 2 - axis, axis=1)[:, :2] * [1, np.sign(normal[axis]) or 1]  # from the side it turns left on
-    left, found, i, failed = list(range(len(corners))), [], 0, 0
-    while len(left) > 3 and failed < len(left):
-        ear = [left[i - 1], left[i], left[(i + 1) % len(left)]]
-        edges = flat[[ear[1], ear[2], ear[0]]] - flat[ear]
-        beside = flat[[j for j in left if j not in ear]][:, None] - flat[ear]
-        inside = (edges[:, 0] * beside[..., 1] - edges[:, 1] * beside[..., 0] >= 0).all(axis=1)
-        if edges[0, 0] * edges[1, 1] > edges[0, 1] * edges[1, 0] and not inside.any():
-            found.append(tuple(ear))
-            left.pop(i)
-            i, failed = max(i - 1, 0), 0  # what lies before was no ear, and still is none
-        else:
-            i, failed = (i + 1) % len(left), failed + 1
-    return np.array(found + [(left[0], b, c) for b, c in zip(left[1:-1], left[2:], strict=True)])

@@ -2,11 +2,6 @@
 
 Points are drawn uniformly by area over all parts, or spread evenly.  The material of each is looked up with the
 interpolation of the renderer and multiplied by the interpolated vertex colour; points that it cuts out are replaced.
-
-A texel of a normal map says where the normal points along the directions in which u grows, in which v falls (v runs
-down the rows, and the map's green is up), and outwards.  On a triangle the position is linear in the texture
-coordinates, so that two of its edges give both directions; they are made perpendicular to the interpolated normal.
-Where the coordinates have no area the normal stays.
 """
 
 from dataclasses import replace
@@ -17,6 +12,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import CHANNELS, Asset, Part, lookup
 from spnr_jax.kernels.cloud_arrays import farthest_points
+from spnr_jax.kernels.triangles import face_crosses, tilt_normals, unit
 
 Spread = Literal["random", "even"]
 MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it counts as nowhere
@@ -129,38 +125,3 @@ def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> tuple
         normals = tilt_normals(normals, normal_map, part.positions[corners], part.texcoords[corners])
     solid = np.ones(len(face), bool) if opacity is None else opacity >= look.cutoff
     return {"positions": interpolate(part.positions), "normals": normals, **found}, solid
-
-
-def face_crosses(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals (f, 3) of twice the triangles' area."""
-    a, b, c = np.moveaxis(positions[faces], 1, 0)
-    return np.cross(b - a, c - a)
-
-
-def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit mean normals (v, 3) of the faces (f, 3) around each vertex, weighted by area; y where there is none."""
-    sums = np.zeros_like(positions)
-    np.add.at(sums, faces, face_crosses(positions, faces)[:, None])
-    return unit(sums, np.array([0.0, 1.0, 0.0]))
-
-
-def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
-    """Vectors (n, 3) of length 1; where one has no length, the fallback."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    directed = vectors / np.where(length > 0, length, 1)
-    return directed if fallback is None else np.where(length > 0, directed, fallback)
-
-
-def tilt_normals(normals: np.ndarray, texels: np.ndarray, corners: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) tilted by texels (n, 3), on triangles with corners (n, 3, 3) and texcoords (n, 3, 2)."""
-    edges, steps = corners[:, 1:] - corners[:, :1], texcoords[:, 1:] - texcoords[:, :1]
-    area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
-    side = np.where(area < 0, -1.0, 1.0)[:, None]  # the length does not matter, so that nothing is divided by the area
-    along_u = side * (edges[:, 0] * steps[:, 1, 1, None] - edges[:, 1] * steps[:, 0, 1, None])
-    against_v = side * (edges[:, 0] * steps[:, 1, 0, None] - edges[:, 1] * steps[:, 0, 0, None])
-    tangent = unit(along_u - normals * np.sum(along_u * normals, axis=-1, keepdims=True))
-    across = np.cross(normals, tangent)
-    across *= np.where(np.sum(across * against_v, axis=-1, keepdims=True) < 0, -1, 1)
-    found = unit(texels[:, :1] * tangent + texels[:, 1:2] * across + texels[:, 2:] * normals)
-    sound = (area != 0) & np.isfinite(found).all(axis=-1) & tangent.any(axis=-1) & found.any(axis=-1)
-    return np.where(sound[:, None], found, normals)

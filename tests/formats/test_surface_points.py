@@ -13,7 +13,8 @@ from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import bitmap_texture
 from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
 from spnr_jax.formats.meshes import load_mesh
-from spnr_jax.formats.surface_points import normalise, sample_surface, tilt_normals
+from spnr_jax.formats.surface_points import normalise, sample_surface
+from spnr_jax.kernels.triangles import tilt_normals
 
 FACES = SQUARE.reshape(2, 3)
 
