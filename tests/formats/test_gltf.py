@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, png, textured_square
+from support.mesh_files import glass, painted, refusal, square
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
 from support.point_tables import WHOLE, as_scan
 
@@ -81,22 +82,6 @@ def test_quantised_and_strided_positions_are_decoded(tmp_path):
 # What is refused
 
 
-def plain(builder=None, change=lambda document: None, **primitive):
-    """A document with a square, after a change."""
-    builder = builder or GltfBuilder()
-    builder.mesh(builder.primitive(**primitive))
-    change(builder.document)
-    return builder
-
-
-def looking(texture=None, **material):
-    """A document with a square of a material, with a texture of that name."""
-    builder = GltfBuilder()
-    if texture:
-        material["pbrMetallicRoughness"] = {"baseColorTexture": {"index": builder.texture(uri=texture)}}
-    return plain(builder, material=builder.material(name="glass", **material))
-
-
 def repeat(document):
     document["nodes"] += [{"mesh": 0}] * 300
     document["scenes"][0]["nodes"] = list(range(301))
@@ -105,33 +90,26 @@ def repeat(document):
 TRANSMISSION = {"KHR_materials_transmission": {"transmissionFactor": 0.5}}
 OUTSIDE = "../secret.png", "a/../../secret.png", "/etc/hostname", "..%2fsecret.png", "file:///x", "C:\\x.png"
 REFUSED = (
-    (looking(alphaMode="BLEND"), "is transparent: material 'glass' has alphaMode BLEND"),
-    (looking(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),
-    (looking(extensions=TRANSMISSION), "KHR_materials_transmission"),
-    *((plain(GltfBuilder(extensionsRequired=[x])), x) for x in ("EXT_mesh_gpu_instancing", "ABC_unheard_of")),
-    (plain(change=lambda d: d["accessors"][0].pop("bufferView")), "accessor 0 is sparse or holds no data"),
-    (plain(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
-    (plain(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
-    (looking("textures/gone.png"), "missing: 'textures/gone.png'"),
-    *((looking(uri), "outside its own folder") for uri in OUTSIDE),
-    (looking("broken.png"), "broken.png"),
-    (looking("a.ktx2"), "cannot be read: a.ktx2 (KTX2, which is not read: convert it to PNG"),
-    (plain(change=repeat, indices=np.zeros(3 * 30_000, np.uint16)), "repeats its meshes more than can be read"),
+    (glass(alphaMode="BLEND"), "is transparent: material 'glass' has alphaMode BLEND"),
+    (glass(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),
+    (glass(extensions=TRANSMISSION), "KHR_materials_transmission"),
+    *((square(GltfBuilder(extensionsRequired=[x])), x) for x in ("EXT_mesh_gpu_instancing", "ABC_unheard_of")),
+    (square(change=lambda d: d["accessors"][0].pop("bufferView")), "accessor 0 is sparse or holds no data"),
+    (square(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
+    (square(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
+    (glass("textures/gone.png"), "missing: 'textures/gone.png'"),
+    *((glass(uri), "outside its own folder") for uri in OUTSIDE),
+    (glass("broken.png"), "broken.png"),
+    (glass("a.ktx2"), "cannot be read: a.ktx2 (KTX2, which is not read: convert it to PNG"),
+    (square(change=repeat, indices=np.zeros(3 * 30_000, np.uint16)), "repeats its meshes more than can be read"),
     (GltfBuilder(), "has no faces"),
-    (plain(indices=SQUARE[:4], mode=1), "has no faces"),
-    *((plain(positions=np.where(CORNERS > 0, np.float32(value), 0)), "not finite") for value in (np.nan, np.inf)),
-    (plain(positions=np.ones_like(CORNERS)), "zero extent"),
-    (plain(indices=np.array([0, 1, 9], np.uint16)), "vertices 0 to 9 of 4"),
-    (plain(NORMAL=np.ones((3, 3), np.float32)), "normals of shape (3, 3) where (4, 3) is needed"),
-    (plain(change=lambda d: d["nodes"][0].update(children=[0])), "not a tree"),
+    (square(indices=SQUARE[:4], mode=1), "has no faces"),
+    *((square(positions=np.where(CORNERS > 0, np.float32(value), 0)), "not finite") for value in (np.nan, np.inf)),
+    (square(positions=np.ones_like(CORNERS)), "zero extent"),
+    (square(indices=np.array([0, 1, 9], np.uint16)), "vertices 0 to 9 of 4"),
+    (square(NORMAL=np.ones((3, 3), np.float32)), "normals of shape (3, 3) where (4, 3) is needed"),
+    (square(change=lambda d: d["nodes"][0].update(children=[0])), "not a tree"),
 )
-
-
-def reason(path):
-    with pytest.raises(UserError) as caught:
-        load_mesh(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize(("builder", "words"), REFUSED)
@@ -141,15 +119,15 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, builder, words):
     (tmp_path / "secret.png").write_bytes(png(CHECKER))
     (folder / "broken.png").write_bytes(png(CHECKER)[:40])
     (folder / "a.ktx2").write_bytes(b"\xabKTX 20\xbb\r\n\x1a\n")
-    assert words in reason(builder.write(folder / "bad.glb"))
+    assert words in refusal(builder.write(folder / "bad.glb"))
 
 
 def test_buffers_that_are_missing_or_shorter_than_their_views_are_named(tmp_path):
-    path = plain().write(tmp_path / "bad.gltf")
+    path = square().write(tmp_path / "bad.gltf")
     (tmp_path / "data.bin").write_bytes(b"short")
-    assert "truncated" in reason(path)
+    assert "truncated" in refusal(path)
     (tmp_path / "data.bin").unlink()
-    assert "missing: 'data.bin'" in reason(path)
+    assert "missing: 'data.bin'" in refusal(path)
 
 
 # Materials
@@ -160,17 +138,6 @@ GREEN, BLUE = CHECKER[..., 1] / 255, CHECKER[..., 2] / 255
 # "utilizes only the lower left quadrant of the source image, rotated clockwise 90 degrees"
 MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}}}
 QUADRANT = [[0.5, 1], [0.5, 0.5], [0, 0.5], [0, 1]]
-
-
-def painted(wrap=10497, surface=None, info=(), **factors):
-    """What makes a material with a texture, and perhaps one of roughness and metallic."""
-
-    def make(builder):
-        pbr = {"baseColorTexture": {"index": builder.texture(CHECKER, wrapS=wrap, wrapT=10497), **dict(info)}}
-        rough = {"metallicRoughnessTexture": {"index": builder.texture(CHECKER), **(surface or {})}}
-        return {"pbrMetallicRoughness": pbr | factors | (rough if surface is not None else {})}
-
-    return make
 
 
 def glossy(builder):
@@ -301,7 +268,7 @@ def test_a_draco_mesh_that_lacks_something_or_is_cut_anywhere_is_refused_in_one_
         builders[-1].document["bufferViews"][0]["byteLength"] = length
     words = "has no POSITION in its Draco mesh", "broken or truncated", "Draco mesh that is broken or cut off"
     for builder in builders:
-        said = reason(builder.write(tmp_path / "bad.glb"))
+        said = refusal(builder.write(tmp_path / "bad.glb"))
         assert any(phrase in said for phrase in words)
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
-from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
+from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder
+from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent, obj_leaf, refusal, write_obj
 
 from data_gen.plan.sources import find_meshes
 from spnr_jax.errors import UserError
@@ -80,21 +80,8 @@ def test_geometry_agrees_with_trimesh(name):
 
 # OBJ and MTL
 
-VERTICES = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 PAINTED = f"{VERTICES}usemtl paint\nf 1 2 3 4\n"
-TEXTURED = f"{VERTICES}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 2\nusemtl paint\nf 1/1/1 2/2/1 3/3/1 4/4/1\n"
-CHECKER = np.random.default_rng(1).integers(0, 256, (4, 4, 3))
-
-
-def load_obj(folder, text, mtl=None):
-    """The asset of an OBJ and a library; images lie beside them."""
-    for name in ("3d wood.png", "wood.png"):
-        (folder / name).write_bytes(png(CHECKER))
-    if mtl is not None:
-        (folder / "look.mtl").write_text(mtl)
-        text = "mtllib look.mtl\n" + text
-    (folder / "object.obj").write_text(text)
-    return load_mesh(folder / "object.obj")
+TEXTURED = f"{VERTICES}{TEXCOORDS}vn 0 0 2\nusemtl paint\nf 1/1/1 2/2/1 3/3/1 4/4/1\n"
 
 
 SQUARES = "f 1 2 3 4\n", "f 1 2 3\nf 1 3 4\n", "f -4 -3 -2 -1\n", "\tf\t1 2 3\n  f 1 3 4\n", "f 1 2 3 \\\n4\n"
@@ -102,7 +89,9 @@ SQUARES = "f 1 2 3 4\n", "f 1 2 3\nf 1 3 4\n", "f -4 -3 -2 -1\n", "\tf\t1 2 3\n 
 
 @pytest.mark.parametrize("faces", SQUARES)
 def test_every_way_to_write_a_square_gives_it_and_relative_numbers_count_from_where_they_stand(tmp_path, faces):
-    (part,) = load_obj(tmp_path, VERTICES + faces + VERTICES.replace(" 0\n", " 5\n") + "f -4 -3 -2 -1\n").parts
+    (part,) = load_mesh(
+        write_obj(tmp_path, VERTICES + faces + VERTICES.replace(" 0\n", " 5\n") + "f -4 -3 -2 -1\n")
+    ).parts
     a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
     np.testing.assert_allclose(np.cross(b - a, c - a), [[0, 0, 1]] * 4)
     assert {tuple(p) for p in part.positions} == {(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 5)}
@@ -110,7 +99,7 @@ def test_every_way_to_write_a_square_gives_it_and_relative_numbers_count_from_wh
 
 
 def test_normals_are_kept_and_v_is_counted_from_above(tmp_path):
-    (part,) = load_obj(tmp_path, TEXTURED, "newmtl paint\nmap_Kd wood.png\n").parts
+    (part,) = load_mesh(write_obj(tmp_path, TEXTURED, "newmtl paint\nmap_Kd pine.png\n")).parts
     np.testing.assert_array_equal(part.normals, [[0, 0, 1]] * 4)
     np.testing.assert_allclose(part.texcoords, np.stack([part.positions[:, 0], 1 - part.positions[:, 1]], axis=-1))
 
@@ -129,7 +118,7 @@ LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ig
 def test_an_opaque_material_has_its_colour_or_texture_and_the_roughness_of_pr_or_of_the_exponent(
     tmp_path, mtl, expected, ignored
 ):
-    asset = load_obj(tmp_path, TEXTURED, f"newmtl paint\n{mtl}\n")
+    asset = load_mesh(write_obj(tmp_path, TEXTURED, f"newmtl paint\n{mtl}\n"))
     look, (color, roughness, metallic, wrap) = asset.parts[0].material, expected
     np.testing.assert_allclose(look.base_color, color, rtol=0, atol=1e-6 if color.ndim > 1 else 0)
     np.testing.assert_allclose([look.roughness, look.metallic], [roughness, metallic], rtol=1e-6)
@@ -138,7 +127,7 @@ def test_an_opaque_material_has_its_colour_or_texture_and_the_roughness_of_pr_or
 
 def test_two_materials_with_odd_names_make_two_parts(tmp_path):
     text = VERTICES + "usemtl dark wood #2\nf 1 2 3\nusemtl usemtl \nf 1 3 4\n"
-    parts = load_obj(tmp_path, text, "newmtl dark wood #2\nKd 0.25 0 0\nnewmtl usemtl\nKd 0 0 0.5\n").parts
+    parts = load_mesh(write_obj(tmp_path, text, "newmtl dark wood #2\nKd 0.25 0 0\nnewmtl usemtl\nKd 0 0 0.5\n")).parts
     look = {tuple(part.material.base_color): part.positions.tolist() for part in parts}
     assert look == {(0.25, 0, 0): [[0, 0, 0], [1, 0, 0], [1, 1, 0]], (0, 0, 0.5): [[0, 0, 0], [1, 1, 0], [0, 1, 0]]}
 
@@ -146,7 +135,7 @@ def test_two_materials_with_odd_names_make_two_parts(tmp_path):
 def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whatever_their_order(tmp_path):
     back = VERTICES.replace("v 1 0 0", "v 1 0 0\nv 1 0 0")  # vertex 3 is vertex 2 again
     text = back + "usemtl red\nf 1 2 4\nusemtl blue\nf 4 3 1\nf 1 4 5\n"
-    asset = load_obj(tmp_path, text, "newmtl blue\nKd 0 0 1\nnewmtl red\nKd 1 0 0\n")
+    asset = load_mesh(write_obj(tmp_path, text, "newmtl blue\nKd 0 0 1\nnewmtl red\nKd 1 0 0\n"))
     assert {tuple(p.material.base_color): len(p.faces) for p in asset.parts} == {(1, 0, 0): 1, (0, 0, 1): 1}
     assert asset.ignored == ("1 doubled faces (one of each is kept)",)
 
@@ -172,9 +161,7 @@ BROKEN = [  # text, library, words of the refusal
 
 @pytest.mark.parametrize(("text", "mtl", "words"), BROKEN)
 def test_what_is_transparent_missing_or_broken_is_refused_in_one_line(tmp_path, text, mtl, words):
-    with pytest.raises(UserError, match=words) as caught:
-        load_obj(tmp_path, text, mtl)
-    assert "\n" not in str(caught.value)
+    assert words in refusal(write_obj(tmp_path, text, mtl))
 
 
 # For pictures, transparent parts are drawn or left out and missing images are gone without; for references neither
@@ -188,39 +175,6 @@ MASK, BLEND = {"alphaMode": "MASK"}, {"alphaMode": "BLEND"}
 ALL, HALF, NONE = 1 / 2, 1 / 3, 0  # share of the points on a square beside a whole one, of which so much is there
 
 
-def half_transparent(low=0, high=255):
-    """Texels red throughout, whose left half has one alpha and whose right half another."""
-    texels = np.zeros((8, 8, 4), np.uint8)
-    texels[..., 0] = 255
-    texels[..., 3] = np.where(np.arange(8) < 4, low, high)
-    return texels
-
-
-def gltf(folder, texels=None, factor=1.0, material=(), uv=UV, alone=False):
-    """A file of a square of the material under test and, unless it is alone, an opaque blue one far away."""
-    builder = GltfBuilder()
-    pbr = {"baseColorFactor": [1, 1, 1, factor]}
-    if texels is not None:
-        pbr["baseColorTexture"] = {"index": builder.texture(texels, wrapS=33071, wrapT=33071)}
-    tested = builder.material(name="leaf", pbrMetallicRoughness=pbr, **dict(material))
-    builder.mesh(builder.primitive(material=tested, TEXCOORD_0=uv))
-    if not alone:
-        blue = builder.material(pbrMetallicRoughness={"baseColorFactor": [0, 0, 1, 1]})
-        builder.mesh(builder.primitive(material=blue), translation=[10, 0, 0])
-    return builder.write(folder / "two.glb")
-
-
-def obj(folder, statement, texels=None):
-    """The same as OBJ and MTL."""
-    if texels is not None:
-        Image.fromarray(texels).save(folder / "mask.png")
-    (folder / "look.mtl").write_text(f"newmtl leaf\n{statement}\nnewmtl plain\nKd 0 0 1\n")
-    corners = "".join(f"v {x + a} {y} 0\n" for a in (0, 10) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    faces = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl leaf\nf 1/1 2/2 3/3 4/4\nusemtl plain\nf 5/1 6/2 7/3 8/4\n"
-    (folder / "a.obj").write_text(f"mtllib look.mtl\n{corners}{faces}")
-    return folder / "a.obj"
-
-
 def share_of_tested(asset, spread="random"):
     points = sample_surface(asset, 900, 0, spread).positions
     assert len(points) == 900
@@ -229,18 +183,18 @@ def share_of_tested(asset, spread="random"):
 
 
 CASES = {  # writer, its arguments; share and note for `opaque` and for `skip`
-    "mask": (gltf, (half_transparent(100, 200), 1.0, MASK), (HALF, CUT), (HALF, CUT)),
-    "mask that hides nothing": (gltf, (half_transparent(200, 200), 1.0, MASK), (ALL, None), (ALL, None)),
-    "mask that hides all": (gltf, (half_transparent(200, 200), 0.1, MASK), (NONE, BELOW), (NONE, BELOW)),
-    "glass of a factor": (gltf, (None, 0.2, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "glass that transmits": (gltf, (None, 1.0, GLASS), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "glass of texels": (gltf, (half_transparent(60, 60), 1.0, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "space around blended leaves": (gltf, (half_transparent(5, 200), 1.0, BLEND), (HALF, DRAWN), (HALF, LEFT_OUT)),
-    "blended in name alone": (gltf, (half_transparent(255, 255), 1.0, BLEND), (ALL, None), (ALL, None)),
-    "OBJ's d": (obj, ("Kd 1 0 0\nd 0.3",), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "OBJ's Tr": (obj, ("Kd 1 0 0\nTr 0.8",), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "grey map_d": (obj, ("map_d -clamp on mask.png", half_transparent()[..., 3]), (HALF, CUT), (HALF, CUT)),
-    "alpha of map_d": (obj, ("map_d -clamp on mask.png", half_transparent()), (HALF, CUT), (HALF, CUT)),
+    "mask": (gltf_leaf, (half_transparent(100, 200), 1.0, MASK), (HALF, CUT), (HALF, CUT)),
+    "mask that hides nothing": (gltf_leaf, (half_transparent(200, 200), 1.0, MASK), (ALL, None), (ALL, None)),
+    "mask that hides all": (gltf_leaf, (half_transparent(200, 200), 0.1, MASK), (NONE, BELOW), (NONE, BELOW)),
+    "glass of a factor": (gltf_leaf, (None, 0.2, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "glass that transmits": (gltf_leaf, (None, 1.0, GLASS), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "glass of texels": (gltf_leaf, (half_transparent(60, 60), 1.0, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "space around blended leaves": (gltf_leaf, (half_transparent(5, 200), 1.0, BLEND), (HALF, DRAWN), (HALF, LEFT_OUT)),
+    "blended in name alone": (gltf_leaf, (half_transparent(255, 255), 1.0, BLEND), (ALL, None), (ALL, None)),
+    "OBJ's d": (obj_leaf, ("Kd 1 0 0\nd 0.3",), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "OBJ's Tr": (obj_leaf, ("Kd 1 0 0\nTr 0.8",), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "grey map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()[..., 3]), (HALF, CUT), (HALF, CUT)),
+    "alpha of map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()), (HALF, CUT), (HALF, CUT)),
 }
 
 
@@ -255,17 +209,17 @@ def test_what_lets_light_through_is_drawn_cut_out_or_left_out_and_said(tmp_path,
     assert left > 0.5 - 1 / 8 or share != HALF
     assert asset.notes == ((note,) if note else ())
     assert share_of_tested(asset, "even")[0] > 0 or share == NONE
-    if note or writer is gltf:
+    if note or writer is gltf_leaf:
         with pytest.raises(UserError, match="is transparent: material 'leaf'"):
             load_mesh(path)
 
 
 def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
     with pytest.raises(UserError, match="has nothing to draw: transparent parts left out .* 'leaf'"):
-        load_mesh(gltf(tmp_path, None, 0.0, BLEND, alone=True), transparent_parts="skip")
+        load_mesh(gltf_leaf(tmp_path, None, 0.0, BLEND, alone=True), transparent_parts="skip")
     nearly = half_transparent(0, 0)
     nearly[0, 0, 3] = 255
-    asset = load_mesh(gltf(tmp_path, nearly, 1.0, MASK, UV / 4 + 0.5, alone=True), transparent_parts="opaque")
+    asset = load_mesh(gltf_leaf(tmp_path, nearly, 1.0, MASK, UV / 4 + 0.5, alone=True), transparent_parts="opaque")
     with pytest.raises(UserError, match="next to no surface"):
         sample_surface(asset, 20, 0)
 
@@ -276,7 +230,7 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
     pbr = {"baseColorTexture": {"index": color}, "metallicRoughnessTexture": {"index": surface}}
     material = builder.material(pbrMetallicRoughness=pbr, normalTexture={"index": normal})
     builder.mesh(builder.primitive(material=material, TEXCOORD_0=UV))
-    bare, wood = builder.write(tmp_path / "bare.glb"), obj(tmp_path, "map_Kd C:\\maps\\wood.png\nPr 0.25")
+    bare, wood = builder.write(tmp_path / "bare.glb"), obj_leaf(tmp_path, "map_Kd C:\\maps\\wood.png\nPr 0.25")
     asset = load_mesh(bare, transparent_parts="opaque")
     points = sample_surface(asset, 20, 0)
     for values, expected in ((points.base_color, 0.5), (points.roughness, 0.5), (points.metallic, 0)):
