@@ -14,7 +14,6 @@ from data_gen.render.views import bitmap_texture
 from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
-from spnr_jax.kernels.triangles import tilt_normals
 
 FACES = SQUARE.reshape(2, 3)
 
@@ -120,14 +119,6 @@ def test_vertex_normals_are_what_is_tilted(tmp_path):
     leaning = np.tile(np.float32([0, 0.6, 0.8]), (4, 1))
     found = bumpy_normals(tmp_path, RED, NORMAL=leaning)
     np.testing.assert_allclose(found, [0.8 * leaning[0] + [0.6, 0, 0]] * 10, atol=0.01)
-
-
-def test_where_the_coordinates_have_no_area_the_normal_stays():
-    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3, float)
-    texcoords = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, 0], [0, 1]]], float)
-    normals = np.tile([0.0, 0, 1], (3, 1))
-    found = tilt_normals(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
-    np.testing.assert_array_equal(found, normals)
 
 
 # Texels
