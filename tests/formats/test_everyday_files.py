@@ -16,7 +16,7 @@ from support.point_clouds import BALL, GREEN, LINEAR, read, write, write_rows
 
 from spnr_jax.config import Cut
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.polygons import ears
+from spnr_jax.kernels.triangles import ears
 from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]
