@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spnr_jax.formats.assets import Asset, Part
-from spnr_jax.formats.surface_points import unit
+from spnr_jax.kernels.triangles import unit
 
 MOST_STRETCH, MOST_BEND = 1.25, 2.0
 

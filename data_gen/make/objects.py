@@ -16,8 +16,9 @@ from data_gen.render import views
 from data_gen.render.light import Lights
 from data_gen.render.variant import mitsuba_module
 from data_gen.store import layout
+from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes, surface_points
-from spnr_jax.formats.assets import Asset, Material, RejectedAsset
+from spnr_jax.formats.assets import Asset, Material
 from spnr_jax.surfels.lighting import HEIGHT, resample
 
 
@@ -40,7 +41,7 @@ def make_and_write(bench: Workbench, task: Task) -> str | None:
     mitsuba_module(bench.variant)
     try:
         record = make_record(bench, task)
-    except RejectedAsset as error:
+    except UserError as error:
         return str(error)
     except Exception as error:  # whatever is wrong with one object must not stop the others; its row says what it was
         return f"unexpected {type(error).__name__}: {error}".splitlines()[0]

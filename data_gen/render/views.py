@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset
+from spnr_jax.errors import UserError
+from spnr_jax.formats.assets import Asset, Material, Part
 from spnr_jax.formats.data_sets import on_white
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
@@ -163,7 +164,7 @@ def principled(part: Part) -> dict:
     """The part's material as a description of Mitsuba's principled BSDF."""
     material = part.material
     if part.colors is not None and np.ndim(material.base_color) == 3:
-        raise RejectedAsset("vertex colours on top of a base-colour texture cannot be rendered; bake them into one")
+        raise UserError("vertex colours on top of a base-colour texture cannot be rendered; bake them into one")
     if part.colors is not None:
         base_color: dict = {"type": "mesh_attribute", "name": "vertex_color"}
     elif np.ndim(material.base_color) == 3:

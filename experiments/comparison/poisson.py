@@ -24,8 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.assets import Asset, Material, Part
 from spnr_jax.formats.images import read_envmap
-from spnr_jax.formats.surface_points import vertex_normals
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.triangles import vertex_normals
 from spnr_jax.surfels.normals import outward_normals
 from spnr_jax.surfels.skies import indoor_envmap
 

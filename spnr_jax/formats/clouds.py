@@ -12,7 +12,7 @@
 What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a line about every assumption.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -141,47 +141,52 @@ class Points(NamedTuple):
 
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
-    pieces, noise = column_pieces(path, kind), 0.0
+    pieces, noise, cut = column_pieces(path, kind), 0.0, how.cut
     if pieces is None:
         from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
 
         asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
         pieces = None if asset.points is None else iter([asset.points])
     points = _sample_mesh(asset, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
-    rows, lines = scenes.select_object(points.positions, points.origin, how.cut.remove_plane, how.cut.nth, how.seed)
+    rows, lines = scenes.select_object(points.positions, points.origin, cut.remove_plane, cut.nth, how.seed)
     points = points.take(rows)
     if pieces is not None and how.clean != "off":
         positions, values, done, noise = clean_columns(points.positions, points.values, how.clean)
         points, lines = Points(positions, values, points.origin), lines + done
     for line in lines:
         how.report(line)
-    return (points if pieces is None else _believing(points, how.report)), noise
+    if pieces is not None and len(points.positions) >= LEAST_POINTS:
+        _check_values(points, how.report)
+    return points, noise
 
 
 def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
     """The cloud of the points, thinned, with normals, upright, moved to its origin."""
-    up, count = how.up, how.num_points
-    sensor = sensor_of(path, kind, points.positions + points.origin, how.report)
+    up, count, before = how.up, how.num_points, points.origin
+    sensor = sensor_of(path, kind, points.positions + before, how.report)
     kept = np.arange(len(points.positions))
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
         kept = np.sort(farthest_points(points.positions, count, how.seed))
-    fewer = points.take(kept)
-    if "normals" not in points.values and sensor:
-        fewer.values["normals"] = face_sensor(fewer.positions, points.positions, sensor.place - points.origin, noise)
+    positions, values, _ = points.take(kept)
+    if "normals" not in values and sensor:
+        values["normals"] = face_sensor(positions, points.positions, sensor.place - before, noise)
         how.report("normals turned to the place of the sensor")
-    elif "normals" not in points.values and len(kept) < len(points.positions):
-        fewer.values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
+    elif "normals" not in values and len(kept) < len(points.positions):
+        values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
         of_camera = sensor and sensor.up
-        up, reason = (of_camera, "that of its camera") if of_camera else find_up(fewer.positions, kind)
+        up, reason = (of_camera, "that of its camera") if of_camera else find_up(positions, kind)
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
-    positions, origin = _shift(fewer.positions, points.origin, how.report)
-    values = fewer.values
     if "normals" in values:
         values["normals"] = values["normals"] @ rotation.T
-    return PlacedCloud(cloud=_float32(positions @ rotation.T, values), up=up, rotation=rotation, origin=origin)
+    origin = np.zeros(3)
+    if _coarse(positions + before):
+        origin = np.floor((positions + before).min(axis=0))
+        how.report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
+    cloud = _float32((positions + (before - origin)) @ rotation.T, values)
+    return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=origin)
 
 
 @np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
@@ -201,11 +206,8 @@ def cloud_of_ply(content: bytes) -> PointCloud:
 
 
 def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud:
-    return PointCloud(
-        positions=positions.astype(np.float32),
-        **{name: column.astype(np.float32) for name, column in values.items()},
-        mask=np.ones(len(positions), bool),
-    )
+    columns = {name: column.astype(np.float32) for name, column in values.items()}
+    return PointCloud(positions=positions.astype(np.float32), mask=np.ones(len(positions), bool), **columns)
 
 
 def _coarse(positions: np.ndarray) -> bool:
@@ -214,31 +216,23 @@ def _coarse(positions: np.ndarray) -> bool:
     return bool(step > COARSEST_STEP * np.ptp(positions, axis=0).max() > 0)
 
 
-def _shift(positions: np.ndarray, before: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) from which `before` was subtracted, and the origin that is subtracted in the end."""
-    whole = positions + before
-    if not _coarse(whole):
-        return whole, np.zeros(3)
-    origin = np.floor(whole.min(axis=0))
-    report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
-    return positions + (before - origin), origin
-
-
 def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    for line in ([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []) + list(asset.notes):
+    for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
         report(line)
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     if kind not in TEXT_MESHES:
-        _check_vertices(asset, report)
+        vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
+        # they come as float64, also from files that have them shorter
+        short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
+        _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
     if _coarse(corners):  # before anything of it becomes float32
         origin = np.floor(corners[0])
-        parts = tuple(replace(part, positions=part.positions - origin) for part in asset.parts)
-        asset = replace(asset, parts=parts)
+        asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
     report(f"{count} points spread over the surface of the mesh")
     values = {name: getattr(drawn, name) for name in DEFAULTS}
@@ -272,116 +266,81 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
                 high = np.maximum(high, positions[wanted].max(axis=0, initial=-np.inf))
                 inside = scenes.is_inside(positions, cut.crop)
                 outside += int(np.count_nonzero(wanted & ~inside))
-                wanted = wanted & inside
+                wanted &= inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
-    columns, seen = sample_stream(sound_pieces(), capacity)
-    if broken and not seen + outside:
-        raise UserError(f"holds no point that can be used: {BROKEN} in all of its {broken} rows")
+    columns, inside = sample_stream(sound_pieces(), capacity)
+    if not inside + outside:
+        nothing = f"no point that can be used: {BROKEN} in all of its {broken} rows" if broken else "0 points"
+        raise UserError(f"holds {nothing}")
     if broken:
-        report(f"{broken:,} of {seen + outside + broken:,} points left out: {BROKEN}")
-    if cut.crop and seen + outside:
-        report(scenes.describe_crop(seen, seen + outside, cut.crop, low, high))
-    if seen > capacity:
-        report(f"{len(columns['x'])} of {seen} points kept while reading, drawn at random")
+        report(f"{broken:,} of {inside + outside + broken:,} points left out: {BROKEN}")
+    if cut.crop:
+        report(scenes.describe_crop(inside, inside + outside, cut.crop, low, high))
+    if inside > capacity:
+        report(f"{len(columns['x'])} of {inside} points kept while reading, drawn at random")
     return columns
 
 
 def _interpret(columns: Columns, how: Reading) -> Points:
     """What the columns of a file of points mean, equal and nearly equal points as one."""
-    if not columns or len(columns["x"]) == 0:
-        raise UserError("holds 0 points")
-    columns = keep_visible(columns, how.cut.keep_noise, how.report)
+    columns, report = keep_visible(columns, how.cut.keep_noise, how.report), how.report
     positions = stack_columns(columns)
-    _check_steps(positions, np.array([_step(columns[axis]) for axis in "xyz"]), how.report)
-    _check_values(positions, how.report)
-    origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
-    values, directions = materials(columns, how.report), normals(columns)
-    values |= {} if directions is None else {"normals": directions}
-    places, values, merged = merge_repeats(positions - origin, values)
-    if merged:
-        how.report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
-    require_surface(places, len(positions))
-    if len(places) < FEWEST:
-        how.report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
-    return Points(places, values, origin)
-
-
-def _step(column: np.ndarray) -> float:
-    """How far the numbers of a column lie apart where they are largest, 0 where that does not matter."""
-    short = column.dtype.kind == "f" and column.dtype.itemsize <= 4
-    return float(np.spacing(np.abs(column).max())) if short else 0.0
-
-
-def _check_vertices(asset: Asset, report: Report) -> None:
-    """What `_check_steps` says of vertices, which come as float64 from files that may have them shorter."""
-    vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
-    short = vertices.astype(np.float32)
-    steps = np.spacing(np.abs(short).max(axis=0)).astype(np.float64)
-    _check_steps(vertices, steps * ((vertices == short).all() and (vertices % 1).any()), report)
-
-
-def _check_values(positions: np.ndarray, report: Report) -> None:
-    """A line where one axis of points has next to no different values beside the others."""
+    _check_steps(positions, [columns[axis] for axis in "xyz"], report)
     counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
     for axis, count, width in zip("xyz", counts, extent, strict=True):
         if 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
             report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
+    origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
+    values, directions = materials(columns, report), normals(columns)
+    values |= {} if directions is None else {"normals": directions}
+    places, values, merged = merge_repeats(positions - origin, values)
+    if merged:
+        report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
+    require_surface(places, len(positions))
+    if len(places) < FEWEST:
+        report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
+    return Points(places, values, origin)
 
 
-def _check_steps(positions: np.ndarray, steps: np.ndarray, report: Report) -> None:
-    """A line where the file rounds an axis coarsely or has it in degrees; ValueError where no shape is left."""
-    extent = np.ptp(positions, axis=0)
+def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
+    """A line where the file's columns round an axis coarsely or are degrees; ValueError where no shape is left."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    x, y, z = extent = high - low
+    short = [np.abs(column) if column.dtype.kind == "f" and column.dtype.itemsize <= 4 else None for column in columns]
+    steps = np.array([0.0 if column is None else float(np.spacing(column.max())) for column in short])
     if steps.max() > LOST_STEP * extent.max() > 0:
-        raise UserError(
-            f"holds points {steps.max():g} apart at best in float32, for an extent of {extent.max():g}; "
-            "move them to the origin"
-        )
+        found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
+        raise UserError(f"holds points {found}; move them to the origin")
     for axis, step, width, column in zip("xyz", steps, extent, positions.T, strict=True):
         if step > LOST_STEP * width > 0:
             report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
-    x, y, z = extent
-    lowest, highest = positions.min(axis=0), positions.max(axis=0)
-    on_earth = lowest[0] >= -180 and highest[0] <= 180 and lowest[1] >= -90 and highest[1] <= 90
+    on_earth = (low[:2] >= [-180, -90]).all() and (high[:2] <= [180, 90]).all()
     if on_earth and 0 < max(x, y) < DEGREES and z > NEEDLE * max(x, y):
-        report(
-            f"x and y look like degrees of longitude and latitude: {max(x, y):.2g} wide and {z:.3g} high; "
-            "project them to metres first"
-        )
+        size = f"{max(x, y):.2g} wide and {z:.3g} high"
+        report(f"x and y look like degrees of longitude and latitude: {size}; project them to metres first")
 
 
-def _believing(points: Points, report: Report) -> Points:
-    """The points with what the file says of them, where the points themselves do not speak against it."""
-    positions, values = points.positions, dict(points.values)
-    if len(positions) < LEAST_POINTS:
-        return points
-    tree = cKDTree(positions)
-    black = np.asarray(~values["base_color"].any(axis=1))
-    if 0.1 < black.mean() < 0.9 and _is_mixed(tree, black):
-        report(
-            f"{int(black.sum()):,} of {len(black):,} points have no colour (0 0 0): that of their neighbours is taken"
-        )
-        near = cKDTree(positions[~black]).query(positions[black], 3)[1]
-        values["base_color"] = values["base_color"].copy()
-        values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
+def _check_values(points: Points, report: Report) -> None:
+    """Puts right what the file says of points, and leaves out its normals, where the points speak against them."""
+    positions, values, _ = points
+    tree, black = cKDTree(positions), np.asarray(~values["base_color"].any(axis=1))
+    if 0.1 < (share := black.mean()) < 0.9:
+        rows = np.flatnonzero(black)
+        near = tree.query(positions[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]
+        if black[near].mean() < share + 0.25 * (1 - share):  # they lie among the others as if chosen by chance
+            of_all = f"{len(rows):,} of {len(black):,} points"
+            report(f"{of_all} have no colour (0 0 0): that of their neighbours is taken")
+            near = cKDTree(positions[~black]).query(positions[black], 3)[1]
+            values["base_color"] = values["base_color"].copy()
+            values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
     centred = positions - positions.mean(axis=0)
-    thickness = float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0])) / max(
-        measure_spacing(tree), 1e-300
-    )
+    thickness = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]) / max(measure_spacing(tree), 1e-300)
     if THIN[0] < thickness < THIN[1]:
         report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
     if "normals" in values and (reason := _doubt(positions, values["normals"])):
         report(f"normals of the file left out: {reason}")
         del values["normals"]
-    return Points(positions, values, points.origin)
-
-
-def _is_mixed(tree: cKDTree, black: np.ndarray) -> bool:
-    """Whether black points lie among the others as if chosen by chance, and not in parts of their own."""
-    rows = np.flatnonzero(black)
-    near = tree.query(tree.data[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]
-    share = black.mean()
-    return bool(black[near].mean() < share + 0.25 * (1 - share))
 
 
 def _doubt(positions: np.ndarray, normals: np.ndarray) -> str:

@@ -90,10 +90,8 @@ def useful(columns: Columns) -> Columns:
 
 def sound(columns: Columns) -> np.ndarray:
     """Mask (points,) of rows whose position, colour, opacity and materials are numbers that float32 holds."""
-    names = (*POSITION, *LINEAR, *SRGB, "roughness", "metallic", "alpha", "opacity", "splat_opacity")
-    largest = np.finfo(np.float32).max
-    mask = np.ones(len(columns["x"]), bool)
-    for name in columns.keys() & set(names):
+    mask, largest = np.ones(len(columns["x"]), bool), np.finfo(np.float32).max
+    for name in columns.keys() - {*NORMAL, "intensity", "rgb", "rgba", "classification", "withheld"}:
         values = np.asarray(columns[name], np.float64)
         # infinite is what an opacity of 0 or 1 is before the logistic function
         mask &= ~np.isnan(values) if name == "splat_opacity" else np.abs(values) < largest
@@ -105,37 +103,37 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
     With `keep_noise` all of them; a line about each kind that is left out.
     """
-    left_out = {"opacity near 0": _invisible(columns)}
-    if "classification" in columns:
-        left_out["noise in their classification (7, 18)"] = np.isin(columns["classification"], NOISE_CLASSES)
-    if "withheld" in columns:
-        left_out["withheld by the scanner's software"] = columns["withheld"] != 0
     wanted = np.ones(len(columns["x"]), bool)
+    left_out = {
+        "opacity near 0": _invisible(columns),
+        "noise in their classification (7, 18)": np.isin(columns.get("classification", ~wanted), NOISE_CLASSES),
+        "withheld by the scanner's software": columns.get("withheld", ~wanted) != 0,
+    }
     for reason, mask in left_out.items():
         if keep_noise or not mask.any():
             continue
         if mask.all():
             report(f"all points kept, though it holds for each: {reason}")
-            continue
-        report(f"{int(mask.sum()):,} of {len(mask):,} points left out: {reason} (--keep-noise keeps them)")
-        wanted &= ~mask
+        else:
+            report(f"{int(mask.sum()):,} of {len(mask):,} points left out: {reason} (--keep-noise keeps them)")
+            wanted &= ~mask
     return columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
 
 def _invisible(columns: Columns) -> np.ndarray:
     """True for points that hide next to nothing; for none where the file does not say so, or says it of all."""
-    values = np.asarray(columns.get("splat_opacity", columns.get("opacity", 0)), np.float64)
-    if "splat_opacity" in columns or values.min(initial=0) < 0:
-        if values.min(initial=0) >= 0 and values.max(initial=0) <= 1:
-            return values < FOG
-        return values < np.log(FOG / (1 - FOG))  # as Kerbl et al. write it, before the logistic function
+    nothing = np.zeros(len(columns["x"]))
+    values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
+    low, high = values.min(initial=0), values.max(initial=0)
+    if "splat_opacity" in columns or low < 0:
+        # as Kerbl et al. write it, before the logistic function, unless all are 0 to 1
+        return values < (FOG if low >= 0 and high <= 1 else np.log(FOG / (1 - FOG)))
     if "alpha" not in columns and "rgba" in columns:
         columns["alpha"] = _unpack(columns["rgba"])[:, 3]
-    values = columns.get("alpha", columns.get("opacity", np.zeros(len(columns["x"]))))
+    values = columns.get("alpha", columns.get("opacity", nothing))
     highest = float(values.max(initial=0))
-    if not highest > 0:  # as packed colours have it where nobody wrote one
-        return np.zeros(len(values), bool)
-    return values < INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2)
+    # packed colours have 0 where nobody wrote an alpha
+    return values < (INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2) if highest > 0 else -np.inf)
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
@@ -143,18 +141,14 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
 
     `materials_known` (points,) is 0 where the file has neither of the latter.
     """
-    count, complete = len(columns["x"]), {}
+    count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
+    found |= {name: _unit_interval(columns[name], name) for name in ("roughness", "metallic") if name in columns}
+    complete = {} if len(found) > 1 else {"materials_known": np.zeros(count)}
     for name, default in DEFAULTS.items():
-        if name == "base_color":
-            values = _base_color(columns, report)
-        else:
-            values = _unit_interval(columns[name], name) if name in columns else None
-        if values is None:
+        if (values := found.get(name)) is None:
             report(f"no {name} in the file: {default:g} taken for all points")
             values = np.full((count, 3) if name == "base_color" else count, default)
         complete[name] = values
-    if not {"roughness", "metallic"} & columns.keys():
-        complete["materials_known"] = np.zeros(count)
     return complete
 
 
@@ -170,20 +164,16 @@ def normals(columns: Columns) -> np.ndarray | None:
 
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     """Linear base colours (points, 3) from the columns that hold some, None if there are none."""
+    intensity = np.asarray(columns.get("intensity", [np.nan]), np.float64)
     # a lidar's record has colours whether or not it saw them
-    sharp = set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
-    unseen = sharp and "intensity" in columns and not any(columns[name].any() for name in SRGB)
+    sharp = "intensity" in columns and set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
+    unseen = sharp and not any(columns[name].any() for name in SRGB)
     if not unseen and (found := colors_of(columns)) is not None:
         for line in found[1]:
             report(line)
         return found[0]
-    if "intensity" not in columns:
-        return None
-    intensity = np.asarray(columns["intensity"], np.float64)
-    if not np.isfinite(intensity).all():
-        return None
     dark, bright = intensity.min(), np.quantile(intensity, BRIGHTEST)
-    if not (bright > dark and np.isfinite(bright - dark)):
+    if not (bright > dark and np.isfinite(intensity).all() and np.isfinite(bright - dark)):
         return None
     report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey")
     return srgb_to_linear(np.repeat(np.clip((intensity - dark) / (bright - dark), 0, 1)[:, None], 3, axis=-1))
@@ -192,9 +182,8 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
 def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
     """Roughness or metallic in [0, 1], rounding errors removed; ValueError if they are not."""
     scaled = values / full_scale(values.dtype, float(values.max(initial=0)), linear=True)
-    low, high = scaled.min(), scaled.max()
-    if not (low >= -ROUNDING and high <= 1 + ROUNDING):
-        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1")
+    if not (scaled.min() >= -ROUNDING and scaled.max() <= 1 + ROUNDING):
+        raise UserError(f"has {name} from {scaled.min():g} to {scaled.max():g}; expected 0 to 1")
     return np.clip(scaled, 0, 1)
 
 
@@ -229,25 +218,21 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     """Linear colours (n, 3) in [0, 1] of what a file holds (n, 3), and lines that say how they were read."""
     if not len(channels):
         return np.zeros(channels.shape), []
-    brightest, darkest = channels.max(axis=-1), channels.min(axis=-1)
     strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
-    highest = np.partition(brightest, -1 - strays)[-1 - strays]
-    lowest = np.partition(darkest, strays)[strays]
+    highest = np.partition(channels.max(axis=-1), -1 - strays)[-1 - strays]
     white = full_scale(channels.dtype, float(highest), linear)
+    low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
+    if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
+        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")
     values = channels / white
-    if not (lowest / white >= -ROUNDING and highest / white <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
-        raise UserError(
-            f"has {name} from {lowest / white:g} to {highest / white:g}; expected 0 to 1 (colours: or 0 to 255)"
-        )
     lines = [] if linear else [f"{name} taken as sRGB in 0..{white:g}"]
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
         lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
     values = np.clip(values, 0, 1)
     brightness = values.max(axis=-1)
-    for word, share in (("0", np.mean(brightness == 0)), ("nearly black", np.mean(brightness < DARK))):
-        if len(values) >= LEAST and share > MOSTLY:
-            lines.append(f"{share:.0%} of {name} are {word}: the picture will be black")
-            break
+    dark = {"0": np.mean(brightness == 0), "nearly black": np.mean(brightness < DARK)}
+    if word := next((word for word, share in dark.items() if len(values) >= LEAST and share > MOSTLY), None):
+        lines.append(f"{dark[word]:.0%} of {name} are {word}: the picture will be black")
     return values if linear else srgb_to_linear(values), lines
 
 
@@ -258,7 +243,7 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 def full_scale(kind: np.dtype, highest: float, linear: bool = False) -> float:
     """The value that means full, of colours of this type and up to this value."""
-    if kind.kind == "u" and kind.itemsize == 1:
+    if kind == np.uint8:
         return 255.0
     whole = kind.kind == "u" and kind.itemsize == 2
     if not whole and (linear or highest <= 1 + ROUNDING):

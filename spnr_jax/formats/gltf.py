@@ -1,196 +1,435 @@
-"""glTF 2.0 scenes as raw assets: one part per primitive of a node, node transforms applied from the root.
+"""glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node, in its rest pose.
 
-Normals go through the inverse transpose; a transform that mirrors flips the winding. The rest pose is read.
-What is not modelled is named in `ignored`; an extension that the file requires and that is not known here rejects the
-object.
+Read here and not through trimesh 5.2, whose reader leaves normalised integers unscaled, drops triangle fans, and shows
+a compressed file as vertices at the origin; tests compare the rest with trimesh.  DracoPy (KHR_draco_mesh_compression)
+and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
+
+base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
+texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
+reference converter.  A material has one set of coordinates, that of the first texture that is read; another texture
+that lies differently is replaced by its mean.  What is not modelled is named in `ignored`.
 """
 
+import json
+import struct
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from spnr_jax.formats.assets import Asset, Material, Part, RejectedAsset, Tolerance, TransparentParts
+from spnr_jax.errors import UserError, refusing
+from spnr_jax.formats import assets
+from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
 from spnr_jax.formats.columns import LINEAR, Columns
-from spnr_jax.formats.gltf_file import (
-    BASIS,
-    DRACO,
-    MESHOPT,
-    MOVED,
-    WEBP,
-    GltfFile,
-    GltfMaterial,
-    decode_accessor,
-    decode_mesh,
-    read_material,
-)
-from spnr_jax.formats.polygons import strip_faces
+from spnr_jax.kernels.triangles import strip_faces
 
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+CHUNK_JSON = 0x4E4F534A  # of a .glb
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
+WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
+NEAREST = 9728
+DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
+BASIS, WEBP, MOVED = "KHR_texture_basisu", "EXT_texture_webp", "KHR_texture_transform"
 READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_lights_punctual"}
 DROPPED = {"KHR_lights_punctual", "EXT_mesh_gpu_instancing"}  # of what a scene may use
 SPLATS = "KHR_gaussian_splatting"
-NO_COLORS = np.ones((1, 3))
-OTHERS = ("POSITION", "NORMAL", "COLOR_0")  # columns, beside texture coordinates, that are read
+SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
+TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
+FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
+    "OCTAHEDRAL": ("decode_filter_oct", (4, 8)),
+    "QUATERNION": ("decode_filter_quat", (8,)),
+    "EXPONENTIAL": ("decode_filter_exp", range(4, 257, 4)),
+}
+RGB = slice(3)  # of the channels of texels
+DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of a normal map
+DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
+# texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
+GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
+WORKFLOWS = (  # textures of colour and of reflection, a stand-in for the latter, factor of colour
+    ("baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"),
+    ("diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"),
+)
 # Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
 # costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
 
 
-def list_primitives(file: GltfFile) -> Iterator[tuple[dict, np.ndarray]]:
+def load_gltf(path: Path, loading: Loading) -> list[Part]:
+    """The scene's triangles with their materials, as they lie in the file."""
+    file, ignored = GltfFile(path, loading), loading.ignored
+    document, drawn = file.document, list(list_primitives(file.document))
+    if not loading.strict and (points := _points(file, drawn)):
+        loading.points = points
+        return []
+    for extension in document.get("extensionsRequired", []):
+        if extension not in READABLE and not extension.startswith("KHR_materials_"):
+            raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
+    ignored |= {key for key in ("animations", "skins") if document.get(key)}
+    ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
+    read_look = cache(partial(read_material, file))
+    shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
+    parts, repeated = [], 0
+    for primitive, matrix in drawn:
+        if not (mode := MODES[primitive.get("mode", 4)]).startswith("TRIANGLE"):
+            ignored.add(f"{mode} primitives")
+            continue
+        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+        ignored |= {"morph targets"} if primitive.get("targets") else set()
+        number, key = primitive.get("material"), id(primitive)
+        material, placement = read_look(number)
+        if material is None:
+            continue
+        if key in shapes:
+            repeated += len(shapes[key][1]) + PLACING
+        else:
+            shapes[key] = _shape(file, primitive, mode, f"TEXCOORD_{placement.texcoord_set}")
+        if repeated > MOST_REPEATED:
+            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
+        columns, faces = shapes[key]
+        asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
+        if asks_alpha and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
+            ignored.add("alpha of vertex colours")
+        parts.append(_place(columns, faces, material, placement, matrix))
+    return parts
+
+
+def list_primitives(document: dict) -> Iterator[tuple[dict, np.ndarray]]:
     """(primitive, matrix to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
-    document = file.document
-    nodes = document.get("nodes", [])
+    nodes, seen = document.get("nodes", []), set()
     if scenes := document.get("scenes"):
         roots = scenes[document.get("scene", 0)].get("nodes", [])
     else:
         roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-    seen = set()
     stack = [(root, np.eye(4)) for root in reversed(roots)]
     while stack:
         index, parent = stack.pop()
         if index in seen:
-            raise RejectedAsset(f"its node {index} is reached twice: the scene is not a tree")
+            raise UserError(f"its node {index} is reached twice: the scene is not a tree")
         seen.add(index)
         node = nodes[index]
-        matrix = parent @ _node_matrix(node)
+        if "matrix" in node:
+            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        else:
+            x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+            own = quaternion_matrix([w, x, y, z])
+            own[:3, :3] *= node.get("scale", (1, 1, 1))
+            own[:3, 3] = node.get("translation", (0, 0, 0))
         if "mesh" in node:
-            for primitive in document["meshes"][node["mesh"]]["primitives"]:
-                if (number := primitive["attributes"].get("COLOR_0")) is not None:
-                    document["accessors"][number]["normalized"] = True  # whole numbers always are; some writers forget
-                yield primitive, matrix
-        stack += [(child, matrix) for child in reversed(node.get("children", []))]
+            yield from ((primitive, parent @ own) for primitive in document["meshes"][node["mesh"]]["primitives"])
+        stack += [(child, parent @ own) for child in reversed(node.get("children", []))]
 
 
-def _node_matrix(node: dict) -> np.ndarray:
-    """Matrix (4, 4) from the node's frame to its parent's."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    matrix = quaternion_matrix([w, x, y, z])
-    matrix[:3, :3] *= node.get("scale", (1, 1, 1))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
-
-
-class Shape(NamedTuple):
-    """A primitive in its own frame: columns by name (v, width), and faces (f, 3)."""
-
-    columns: dict[str, np.ndarray]
-    faces: np.ndarray
-
-
-def load_gltf(path: Path, transparent_parts: TransparentParts = "refuse") -> Asset:
-    """The scene's triangles with their materials, as they lie in the file; RejectedAsset if it cannot be used."""
-    file, tolerance = GltfFile(path), Tolerance(transparent_parts)
-    document, drawn = file.document, list(list_primitives(file))
-    if not tolerance.strict and (points := _points(file, drawn)):
-        return Asset(parts=(), points=points)
-    for extension in document.get("extensionsRequired", []):
-        if extension not in READABLE and not extension.startswith("KHR_materials_"):
-            raise RejectedAsset(f"needs {extension}, which cannot be read: export it without that extension")
-    ignored = tolerance.ignored
-    ignored |= {key for key in ("animations", "skins") if document.get(key)}
-    ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
-    materials: dict[int | None, GltfMaterial] = {}
-    shapes: dict[int, Shape] = {}  # by id: the document keeps every primitive alive
-    parts, repeated = [], 0
-    for primitive, matrix in drawn:
-        mode = MODES[primitive.get("mode", 4)]
-        if not mode.startswith("TRIANGLE"):
-            ignored.add(f"{mode} primitives")
-            continue
-        index = primitive.get("material")
-        if index not in materials:
-            materials[index] = read_material(file, index, tolerance)
-        look, again = materials[index], id(primitive) in shapes
-        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
-        if primitive.get("targets"):
-            ignored.add("morph targets")
-        if look.material is None:
-            continue
-        shape = shapes[id(primitive)] if again else _shape(file, primitive, mode, look)
-        shapes[id(primitive)] = shape
-        if look.has_alpha and shape.columns.get("COLOR_0", NO_COLORS)[:, 3:].min(initial=1) < 1:
-            ignored.add("alpha of vertex colours")
-        repeated += again * (len(shape.faces) + PLACING)
-        if repeated > MOST_REPEATED:
-            raise RejectedAsset(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
-        parts.append(_place(shape, look, look.material, matrix))
-    return tolerance.asset(parts)
-
-
-def _points(file: GltfFile, drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
+def _points(file: "GltfFile", drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
     """The columns of the points of a scene without triangles; None if it has some, or no points either."""
     modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
     pieces: list[Columns] = []
-    for primitive, matrix in drawn:
-        if primitive.get("mode") != 0:
-            continue
+    for primitive, matrix in (pair for pair in drawn if pair[0].get("mode") == 0):
         if SPLATS in primitive.get("extensions", {}):
-            raise RejectedAsset(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
-        attributes = primitive["attributes"]
-        positions = file.accessor(attributes["POSITION"]) @ matrix[:3, :3].T + matrix[:3, 3]
-        pieces.append(dict(zip("xyz", positions.T, strict=True)))
-        if "COLOR_0" in attributes:
-            pieces[-1] |= dict(zip((*LINEAR, "alpha"), file.accessor(attributes["COLOR_0"]).T, strict=False))
-    shared = set(pieces[0]).intersection(*pieces[1:])
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0] if name in shared}
+            raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
+        columns = file.columns(primitive["attributes"], "POSITION", "COLOR_0")
+        pieces.append(dict(zip("xyz", (columns["POSITION"] @ matrix[:3, :3].T + matrix[:3, 3]).T, strict=True)))
+        if "COLOR_0" in columns:
+            pieces[-1] |= dict(zip((*LINEAR, "alpha"), columns["COLOR_0"].T, strict=False))
+    shared = [name for name in pieces[0] if all(name in piece for piece in pieces)]
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in shared}
 
 
-def _shape(file: GltfFile, primitive: dict, mode: str, look: GltfMaterial) -> Shape:
-    """The columns that a material needs, and the faces, of a primitive."""
-    names = *OTHERS, f"TEXCOORD_{look.placement.texcoord_set}"
-    wanted = {name: index for name, index in primitive["attributes"].items() if name in names}
-    packed = primitive.get("extensions", {}).get(DRACO)
-    if packed is None:
-        columns = {name: file.accessor(index) for name, index in wanted.items()}
-        given = file.accessor(primitive["indices"])[:, 0] if "indices" in primitive else None
-        order = np.arange(len(columns["POSITION"])) if given is None else given
-        return Shape(columns, _triangles(order, mode))
-    ids = {name: number for name, number in packed["attributes"].items() if name in wanted}
-    if "POSITION" not in ids:
-        raise RejectedAsset("has no POSITION in its Draco mesh: broken file")
-    unpacked, order = decode_mesh(file.view(packed["bufferView"]), ids)
-    accessors = file.document["accessors"]
-    columns = {name: decode_accessor(values, accessors[wanted[name]]) for name, values in unpacked.items()}
-    columns |= {name: file.accessor(wanted[name]) for name in wanted if name not in ids}
-    return Shape(columns, _triangles(order, "TRIANGLES"))  # whatever the mode: Draco keeps triangles
+def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
+    """The columns (v, width) that a material needs, and the faces (f, 3), of a primitive in its own frame."""
+    if DRACO in primitive.get("extensions", {}):
+        file.unpack_mesh(primitive)
+        mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
+    columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0", texcoords)
+    order = np.arange(len(columns["POSITION"]))
+    if "indices" in primitive:
+        order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    if mode == "TRIANGLE_STRIP":
+        return columns, strip_faces(order)
+    if mode == "TRIANGLE_FAN":
+        return columns, np.stack([order[1:-1], order[2:], np.repeat(order[:1], max(0, len(order) - 2))], axis=-1)
+    return columns, order[: len(order) // 3 * 3].reshape(-1, 3)
 
 
-def _place(shape: Shape, look: GltfMaterial, material: Material, matrix: np.ndarray) -> Part:
+def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Placement", matrix: np.ndarray) -> Part:
     """One primitive in world space."""
     linear = matrix[:3, :3]
-    mirrored = np.linalg.det(linear) < 0
-    normals, colors = shape.columns.get("NORMAL"), shape.columns.get("COLOR_0")
-    texcoords = shape.columns.get(f"TEXCOORD_{look.placement.texcoord_set}")
+    side = -1 if np.linalg.det(linear) < 0 else 1
+    # of the matrix, a multiple of the inverse transpose that is defined where it is singular too
+    cofactors = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
+    normals, colors, texcoords = (columns.get(name) for name in ("NORMAL", "COLOR_0", f"TEXCOORD_{place.texcoord_set}"))
     return Part(
-        positions=shape.columns["POSITION"] @ linear.T + matrix[:3, 3],
-        faces=shape.faces[:, ::-1] if mirrored else shape.faces,
+        positions=columns["POSITION"] @ linear.T + matrix[:3, 3],
+        faces=faces[:, ::side],
         material=material,
-        # the adjugate's transpose: a multiple of the inverse transpose, defined for a singular matrix too
-        normals=None if normals is None else normals @ _cofactors(linear).T * (-1 if mirrored else 1),
-        texcoords=None if texcoords is None else look.placement.transform(texcoords),
+        normals=None if normals is None else normals @ cofactors.T * side,
+        texcoords=None if texcoords is None else texcoords @ np.array(place.turn).T + np.array(place.offset),
         colors=None if colors is None else colors[:, :3],
     )
 
 
-def _cofactors(matrix: np.ndarray) -> np.ndarray:
-    """Cofactor matrix (3, 3): determinant times the inverse transpose."""
-    a, b, c = matrix
-    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+# --- the file ---------------------------------------------------------------------------------------------------------
 
 
-def _triangles(order: np.ndarray, mode: str) -> np.ndarray:
-    """Faces (f, 3) of a sequence of vertex indices (n,)."""
-    if mode == "TRIANGLES":
-        return order[: len(order) // 3 * 3].reshape(-1, 3)
-    if len(order) < 3:
-        return np.zeros((0, 3), np.int64)
-    if mode == "TRIANGLE_FAN":
-        return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)
-    return strip_faces(order)
+class GltfFile:
+    """The JSON document of a glTF file (`document`) with access to what its buffers hold."""
+
+    def __init__(self, path: Path, loading: Loading):
+        self.loading, data = loading, path.read_bytes()
+        text, self._binary = _split_glb(data) if data[:4] == b"glTF" else (data, None)
+        try:
+            self.document = json.loads(text.decode("utf-8-sig"))
+        except ValueError as error:
+            raise UserError(f"its glTF header is not JSON, or truncated: {error}") from None
+        version = str(self.document.get("asset", {}).get("version", "1.0"))
+        if not version.startswith("2."):
+            raise UserError(f"is glTF {version}; only glTF 2.0 can be read: convert it")
+        self._buffers: dict[int, bytes] = {}
+        self._views: dict[int, memoryview] = {}
+        self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
+
+    def columns(self, attributes: dict[str, int], *names: str) -> Columns:
+        """The columns (v, width) of those of a primitive's attributes that have one of the names.
+
+        float64 for floats and normalised integers, int64 for other ones.
+        """
+        found = {}
+        for name, index in ((name, index) for name, index in attributes.items() if name in names):
+            values, normalized = self.accessor(index), self.document["accessors"][index].get("normalized")
+            if values.dtype.kind == "f":
+                found[name] = values.astype(np.float64)
+            elif normalized or name == "COLOR_0":  # which always is; some writers forget to say so
+                found[name] = np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1)
+            else:
+                found[name] = values.astype(np.int64)
+        return found
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Values (count, width) of an accessor, as they are stored."""
+        if index in self._unpacked:
+            return self._unpacked[index]
+        accessor = self.document["accessors"][index]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise UserError(f"accessor {index} is sparse or holds no data, which is not read: export it plain")
+        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
+        stride, view = self.document["bufferViews"][number].get("byteStride", dtype.itemsize * width), self.view(number)
+        if count and start + (count - 1) * stride + width * dtype.itemsize > len(view):
+            raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
+        return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
+
+    def view(self, index: int) -> memoryview:
+        """What a buffer view holds."""
+        if index not in self._views:
+            view = self.document["bufferViews"][index]
+            packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
+            data = self._slice(packed or view)
+            self._views[index] = memoryview(unpack(data, packed)) if packed else data
+        return self._views[index]
+
+    def _slice(self, view: dict) -> memoryview:
+        start, length, number = view.get("byteOffset", 0), view["byteLength"], view["buffer"]
+        if number not in self._buffers:
+            uri = self.document["buffers"][number].get("uri")
+            data = self._binary if uri is None else self.loading.read(uri, needed=True)
+            if data is None:
+                raise UserError(f"buffer {number} has no data in the file")
+            self._buffers[number] = data
+        buffer, end = self._buffers[number], start + length
+        if not 0 <= start <= end <= len(buffer):
+            raise UserError(f"buffer {number} has {len(buffer)} bytes where {end} are needed: truncated file")
+        return memoryview(buffer)[start:end]
+
+    def unpack_mesh(self, primitive: dict) -> None:
+        """Makes ready what a primitive keeps in a Draco mesh; whole numbers are as they were before, not normalised.
+
+        The library holds what a mesh announces against the size of its data before it makes room for it.
+        """
+        draco, packed = assets.extra("DracoPy"), primitive["extensions"][DRACO]
+        data = bytes(self.view(packed["bufferView"]))
+        try:
+            mesh = draco.decode(data)
+        except (draco.FileTypeException, ValueError, RuntimeError, MemoryError) as error:
+            raise UserError(f"holds a Draco mesh that is broken or cut off ({error})") from None
+        if getattr(mesh, "faces", None) is None:
+            raise UserError("holds Draco points where triangles are needed: broken file")
+        columns = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
+        for name, number in ({"POSITION": None} | packed["attributes"]).items():
+            if number not in columns:
+                raise UserError(f"has no {name:.40} in its Draco mesh: broken file")
+            self._unpacked[primitive["attributes"][name]] = columns[number].reshape(len(columns[number]), -1)
+        self._unpacked[primitive["indices"]] = np.asarray(mesh.faces).reshape(-1, 1)
+
+
+def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
+    """JSON text and binary chunk of a GLB file."""
+    version, length, size, kind = struct.unpack_from("<4I", data.ljust(20, b"\0"), 4)
+    if version != 2:
+        raise UserError(f"is a GLB container of version {version}; only version 2 (glTF 2.0) can be read: convert it")
+    begin = 20 + size
+    end = begin + 8 + int.from_bytes(data[begin : begin + 4], "little") if begin < length else begin
+    if (needed := max(length, end)) > len(data):
+        raise UserError(f"truncated file: it has {len(data)} bytes where {needed} are announced")
+    if kind != CHUNK_JSON:
+        raise UserError("is a GLB container without a JSON chunk")
+    return data[20:begin], data[begin + 8 : end]
+
+
+def unpack(data: memoryview, packed: dict) -> bytes:
+    """The bytes of a buffer view that meshopt packed, as its extension describes them."""
+    meshopt = assets.extra("meshoptimizer")
+    mode, count, stride, kind = packed["mode"], packed["count"], packed["byteStride"], packed.get("filter", "NONE")
+    with refusing("holds meshopt data that is broken or cut off"):
+        if mode != "ATTRIBUTES":
+            decode = {"TRIANGLES": meshopt.decode_index_buffer, "INDICES": meshopt.decode_index_sequence}[mode]
+            return decode(count, 4, data).astype({2: "<u2", 4: "<u4"}[stride]).tobytes()
+        elements = meshopt.decode_vertex_buffer(count, stride, data, np.dtype((np.void, stride)))
+    if kind == "NONE":
+        return elements.tobytes()
+    function, strides = FILTERS.get(kind, ("", ()))
+    if stride not in strides:
+        raise UserError(f"holds meshopt vertices of {stride} bytes with the filter {kind!r:.40}: cannot be read")
+    return getattr(meshopt, function)(elements, count, stride).tobytes()
+
+
+# --- materials --------------------------------------------------------------------------------------------------------
+
+
+class Placement(NamedTuple):
+    """Texture coordinates: a set of the file's, moved by uv @ turn.T + offset; plain numbers, comparable."""
+
+    wrap: Wrap = "repeat"
+    texcoord_set: int = 0
+    turn: tuple = ((1.0, 0.0), (0.0, 1.0))
+    offset: tuple = (0.0, 0.0)
+
+
+def _read_texture(
+    file: GltfFile, places: list[Placement], info: dict | None, stand_in: tuple[int, ...]
+) -> np.ndarray | None:
+    """Encoded texels (h, w, 4) of a textureInfo, or of the stand-in (4,) where its image may be missing.
+
+    Where it lies is added to the material's `places`; of a texture that lies differently from the first the mean is
+    taken, (1, 1, 4).
+    """
+    if info is None:
+        return None
+    texture = file.document["textures"][info["index"]]
+    texels = _read_image(file, texture)
+    texels = np.array(stand_in, np.uint8).reshape(1, 1, 4) if texels is None else texels
+    places.append(_placement(file, info, texture))
+    if places[-1] == places[0]:
+        return texels
+    file.loading.ignored.add("second texture with its own coordinates (its mean is used)")
+    return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
+
+
+def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
+    """Texels (h, w, 4) of a texture; None where its image is missing."""
+    extensions = texture.get("extensions", {})
+    webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
+    source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
+    if source is None:
+        raise UserError(f"has a texture that cannot be read: {', '.join(extensions) or 'no image'}")
+    image = file.document["images"][source]
+    if "uri" in image:
+        return file.loading.read_image(image["uri"])
+    return assets.read_image(bytes(file.view(image["bufferView"])), f"image {source}")
+
+
+def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:
+    """Where a texture lies.
+
+    Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its GLSL
+    snippet turns the other way).
+    """
+    sampler = file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
+    if wrap != wrap_t:
+        file.loading.ignored.add(f"wrapT {wrap_t} (wrapS {wrap} is used for both)")
+    if sampler.get("magFilter") == NEAREST:
+        file.loading.ignored.add("nearest-texel filter (bilinear is used)")
+    moved = info.get("extensions", {}).get(MOVED, {})
+    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
+    turn = np.array([[cos, sin], [-sin, cos]]) * np.asarray(moved.get("scale", (1, 1)), np.float64)
+    x, y = moved.get("offset", (0, 0))
+    number = moved.get("texCoord", info.get("texCoord", 0))
+    return Placement(wrap, number, tuple(map(tuple, turn.tolist())), (float(x), float(y)))
+
+
+def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
+    """The material `index` of a file (None: glTF's default), None if it is nowhere seen, and where its textures lie."""
+    spec = {} if index is None else file.document["materials"][index]
+    name, extensions, loading = str(spec.get("name", f"number {index}")), spec.get("extensions", {}), file.loading
+    places: list[Placement] = []
+    read = partial(_read_texture, file, places)
+    glossy = extensions.get(SPECULAR_GLOSSINESS)
+    look = spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy
+    of_color, of_surface, stand_in, of_factor = WORKFLOWS[glossy is not None]
+    color, surface = read(look.get(of_color), GREY), read(look.get(of_surface), stand_in)
+    factor = look.get(of_factor, (1, 1, 1, 1))
+    base_color = _scaled(color, RGB, factor[:3], SRGB_TABLE)
+    if glossy is None:
+        metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
+        roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
+    else:
+        specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
+        base_color, metallic = metallic_roughness(base_color, specular)
+        roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
+    # after the textures: a missing file is the plainer reason
+    material = assets.make_material(base_color, roughness, metallic)
+    shown = loading.cut_out(name, material, *_alpha(spec, color, (*factor, 1.0)[3]))
+    if UNLIT in extensions:
+        light = "colours that hold light already (KHR_materials_unlit) taken as base colours"
+        loading.say(light, about=repr(name[: assets.LONGEST_NAME]))
+    loading.ignored |= extensions.keys() - {SPECULAR_GLOSSINESS} | (spec.keys() & {"occlusionTexture"})
+    loading.ignored |= {"emissive"} if any(spec.get("emissiveFactor", ())) else set()
+    if loading.strict:
+        loading.ignored |= spec.keys() & {"normalTexture"}
+    elif (bumps := read(spec.get("normalTexture"), FLAT)) is not None and shown is not None:
+        scale = float(spec["normalTexture"].get("scale", 1.0))
+        shown = replace(shown, normal_map=_scaled(bumps, RGB, np.array([scale, scale, 1], np.float32), DIRECTIONS))
+    placement = [*places, Placement()][0]
+    return shown and replace(shown, wrap=placement.wrap), placement
+
+
+def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table: np.ndarray = LEVELS) -> np.ndarray:
+    """The factor, times channels of texels (h, w, 4) by a table (256,) where there are some."""
+    factor = np.asarray(factor) if isinstance(factor, np.ndarray) else np.asarray(factor, np.float64)
+    return factor if texels is None or not factor.any() else decode_texels(texels[..., channels], table) * factor
+
+
+def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours, (*n, 3) or images of two sizes."""
+    if diffuse.ndim == specular.ndim == 3:
+        height, width = map(max, diffuse.shape[:2], specular.shape[:2])
+        diffuse, specular = assets.resize(diffuse, height, width), assets.resize(specular, height, width)
+    diffuse, specular = np.broadcast_arrays(diffuse, specular)
+    strength = 1 - specular.max(axis=-1)
+    bright_diffuse, bright_specular = (np.sqrt((x * x) @ np.array([0.299, 0.587, 0.114])) for x in (diffuse, specular))
+    b = bright_diffuse * strength / (1 - DIELECTRIC) + bright_specular - 2 * DIELECTRIC
+    discriminant = np.maximum(b * b - 4 * DIELECTRIC * (DIELECTRIC - bright_specular), 0)
+    metallic = np.clip((-b + np.sqrt(discriminant)) / (2 * DIELECTRIC), 0, 1)
+    metallic = np.where(bright_specular < DIELECTRIC, 0, metallic)[..., None]
+    from_diffuse = diffuse * strength[..., None] / (1 - DIELECTRIC) / np.maximum(1 - metallic, 1e-6)
+    from_specular = (specular - DIELECTRIC * (1 - metallic)) / np.maximum(metallic, 1e-6)
+    base_color = from_diffuse + (from_specular - from_diffuse) * metallic**2
+    return np.clip(base_color, 0, 1), metallic[..., 0]
+
+
+def _alpha(spec: dict, color: np.ndarray | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:
+    """Why a material is said to be transparent ("": it is not), its alpha () or (h, w), and the cut-off of a mask."""
+    mode, extensions = spec.get("alphaMode", "OPAQUE"), spec.get("extensions", {})
+    for name, entry in TRANSPARENT.items():
+        if extensions.get(f"KHR_materials_{name}", {}).get(entry, 0) > 0:
+            return f"KHR_materials_{name}", np.zeros(()), None
+    if mode == "OPAQUE":
+        return "", np.ones(()), None
+    cutoff = float(spec.get("alphaCutoff", 0.5)) if mode == "MASK" else None
+    return f"alphaMode {mode}", _scaled(color, 3, factor), cutoff

@@ -22,7 +22,6 @@ from spnr_jax.formats.assets import extra
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
-ITEMS_AT, CHUNK_SIZE_AT = 32, 12
 LARGEST_CHUNK = 2**24  # points; writers use 50,000
 VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
 PIECE_BYTES = 2**23  # of points in memory at a time
@@ -36,7 +35,11 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
     """The columns x y z, the colours and the intensity of a scan, some points at a time."""
     laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
-    _check_header(path)
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        try:
+            _check_sizes(content)
+        except struct.error:
+            raise UserError("is cut off: its header or compressed data ends too early") from None
     try:
         with (
             refusing("is a broken or truncated LAS file"),
@@ -52,72 +55,47 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
         raise UserError(f"is a broken LAZ file ({error})") from None
 
 
-def _check_header(path: Path) -> None:
-    """ValueError if the header announces more than the file can hold."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(COUNT_14 + 8)
-    if head[:4] != b"LASF" or len(head) < SMALLEST_HEADER:
+def _check_sizes(content: mmap.mmap) -> None:
+    """ValueError if a scan announces more than its file holds, in its header or to lazrs."""
+    if content[:4] != b"LASF" or len(content) < SMALLEST_HEADER:
         raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
-    minor = head[25]
-    header_size, data, records, kind, length, count = struct.unpack_from("<HIIBHI", head, SIZES)
-    if minor >= 4 and len(head) == COUNT_14 + 8:
-        (count,) = struct.unpack_from("<Q", head, COUNT_14)
-    if not header_size + records * RECORD_HEAD <= data <= size:
-        raise UserError(f"is broken: {records} records in its header, points from byte {data} on, in {size} bytes")
-    if kind & COMPRESSED:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            check_laz(content, header_size, records, data, length, count)
-    elif not length or data + count * length > size:
-        raise UserError(f"is cut off: its header announces {count} points of {length} bytes, in {size} bytes")
-
-
-def check_laz(content: mmap.mmap, first_record: int, records: int, data: int, length: int, points: int) -> None:
-    """ValueError unless lazrs can be trusted with the bytes of a scan.
-
-    `records` stand from `first_record` on, `points`, of `length` bytes when unpacked, from `data` on.
-    """
-    try:
-        items, chunk_size = _items(content, first_record, records)
-        if sum(size for _, size in items) != length:
-            raise UserError(f"its points have {length} bytes, their items {[size for _, size in items]}")
-        if not chunk_size and any(kind in LAYERS for kind, _ in items):
-            chunk_size = VARIABLE  # as writers of COPC put it
-        if chunk_size != VARIABLE and not 0 < chunk_size <= LARGEST_CHUNK:
-            raise UserError(f"chunks of {chunk_size} points, expected 1 to {LARGEST_CHUNK}")
-        (table,) = struct.unpack_from("<q", content, data)
-        if table == -1:
-            (table,) = struct.unpack_from("<q", content, len(content) - 8)
-        if table < 0:
-            raise UserError(f"its table of chunks lies at byte {table}")
-        _, chunks = struct.unpack_from("<II", content, table)
-        if chunks * length > len(content):  # each begins with a point as it is
-            raise UserError(f"{chunks} chunks in {len(content)} bytes")
-        if chunks * (LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size) < points:
-            raise UserError(f"{points} points in {chunks} chunks")
-        if any(kind in LAYERS for kind, _ in items):
-            _walk(content, data + 8, chunks, length, sum(LAYERS.get(kind, size) for kind, size in items))
-    except struct.error:
-        raise UserError("is cut off: its compressed data ends too early") from None
-
-
-def _items(content: mmap.mmap, place: int, records: int) -> tuple[list[tuple[int, ...]], int]:
-    """((type, size) of each item of a point, points in a chunk) as LASzip's record says."""
+    place, data, records, kind, length, points = struct.unpack_from("<HIIBHI", content, SIZES)
+    if content[25] >= 4 and len(content) >= COUNT_14 + 8:
+        (points,) = struct.unpack_from("<Q", content, COUNT_14)
+    if not place + records * RECORD_HEAD <= data <= len(content):
+        raise UserError(f"is broken: {records} records in its header, points from byte {data} of {len(content)} on")
+    if not kind & COMPRESSED:
+        if not length or data + points * length > len(content):
+            raise UserError(
+                f"is cut off: its header announces {points} points of {length} bytes in {len(content)} bytes"
+            )
+        return
     for _ in range(records):
         name, number, size = struct.unpack_from("<16sHH", content, place + 2)
         if name.rstrip(b"\0") == NAME and number == NUMBER:
-            start = place + RECORD_HEAD
-            (count,) = struct.unpack_from("<H", content, start + ITEMS_AT)
-            (chunk_size,) = struct.unpack_from("<I", content, start + CHUNK_SIZE_AT)
-            places = range(start + ITEMS_AT + 2, start + ITEMS_AT + 2 + 6 * count, 6)
-            return [struct.unpack_from("<HH", content, at) for at in places], chunk_size
+            break
         place += RECORD_HEAD + size
-    raise UserError("has no record that says how its points are compressed")
-
-
-def _walk(content: mmap.mmap, place: int, chunks: int, length: int, layers: int) -> None:
-    """ValueError unless all layers of all chunks end inside the file."""
-    for _ in range(chunks):
+    else:
+        raise UserError("has no record that says how its points are compressed")
+    chunk_size, count = struct.unpack_from("<I16xH", content, place + RECORD_HEAD + 12)
+    items = [struct.unpack_from("<HH", content, place + RECORD_HEAD + 34 + 6 * i) for i in range(count)]
+    layered = any(kind in LAYERS for kind, _ in items)
+    if layered and not chunk_size:
+        chunk_size = VARIABLE  # as writers of COPC put it
+    (table,) = struct.unpack_from("<q", content, data)
+    if table == -1:
+        (table,) = struct.unpack_from("<q", content, len(content) - 8)
+    (chunks,) = struct.unpack_from("<4xI", content, max(table, 0))
+    most = LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size
+    # each chunk begins with a point as it is
+    if sum(size for _, size in items) != length or not 0 < most <= LARGEST_CHUNK or table < 0:
+        raise UserError(
+            f"is broken: points of {length} bytes in items {items}, chunks of {chunk_size}, table at {table}"
+        )
+    if chunks * length > len(content) or chunks * most < points:
+        raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
+    place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)
+    for _ in range(chunks if layered else 0):
         count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
         if place > len(content) or count > LARGEST_CHUNK:

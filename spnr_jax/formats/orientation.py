@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from spnr_jax.formats.row_files import camera_row, read_pcd_header
+from spnr_jax.formats.row_files import element_pieces, read_pcd_header, read_ply_header
 from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
@@ -78,41 +78,40 @@ class Sensor(NamedTuple):
 
 def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
     """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
-    if kind == ".pcd":
-        header = read_pcd_header(path)
-        if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
-            return None
-        place = np.array(header.sensor)
-        if header.organised or _from_there(positions, place, OPEN):
-            return Sensor(place, _up_of_image(positions - place))
-        if place.any() and _from_there(positions, place, MOST, within=True):
-            return Sensor(place)
-        if place.any():
-            report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
-        return None
-    if kind != ".ply":
+    if kind == ".ply":
+        return _camera_of(path)
+    if kind != ".pcd":
         return None
     with path.open("rb") as file:
-        try:
-            row = camera_row(file)
-        except ValueError:  # the points can do without
+        header = read_pcd_header(file)
+    if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
+        return None
+    place = np.array(header.sensor)
+    if header.organised or _from_there(positions, place, OPEN):
+        # a depth image is in its camera's axes, which are y down looking along z or y up looking against it
+        way = np.median(positions - place, axis=0)
+        ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
+        return Sensor(place, None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y")
+    if place.any():
+        if _from_there(positions, place, MOST, within=True):
+            return Sensor(place)
+        report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
+    return None
+
+
+def _camera_of(path: Path) -> Sensor | None:
+    """The camera that a PLY file begins with."""
+    with path.open("rb") as file:
+        header = read_ply_header(file)
+        if [name for name, _, _ in header.elements][:1] != ["camera"]:
             return None
-    place, above = (np.array([row.get(name, np.nan) for name in names]) for names in (PLACE, UP))
+        _, columns, _ = next(element_pieces(file, header, "camera"))
+    place, above = (np.array([columns.get(name, [np.nan])[0] for name in names], float) for names in (PLACE, UP))
     if not (np.abs(place) < FARTHEST).all():
         return None
     if not (np.isfinite(above).all() and above.any()):
         return Sensor(place)
     return Sensor(place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)))
-
-
-def _up_of_image(ways: np.ndarray) -> str | None:
-    """The upward axis of a depth image of points that lie these ways (n, 3) from its camera, None if it was none.
-
-    It is in the camera's axes, which are y down looking along z or y up looking against it.
-    """
-    way = np.median(ways, axis=0)
-    ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
-    return None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:

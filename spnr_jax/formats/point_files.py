@@ -1,12 +1,7 @@
 """Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-    .ply                        spnr_jax/formats/row_files.py, also 3D Gaussian splats
-    .xyz .txt .csv .asc .pts    spnr_jax/formats/point_tables.py
-    .pcd                        spnr_jax/formats/row_files.py
-    .npz .npy                   spnr_jax/formats/point_tables.py
-    .las .laz                   spnr_jax/formats/las.py
-    .spz                        spnr_jax/formats/gaussian_files.py
-    .glb .gltf .obj .off        meshes (spnr_jax/formats/meshes.py), as points where they have no faces
+READERS says which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz .npy),
+las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
 may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
@@ -16,7 +11,7 @@ has them so; what they mean is the affair of spnr_jax/formats/columns.py.
 import io
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from spnr_jax.errors import UserError
@@ -26,31 +21,32 @@ from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.point_tables import numpy_pieces, text_pieces
 from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_elements, read_ply_header
 
+TEXT = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts")
 READERS = {
-    ".ply": lambda path: _ply(path),
-    ".pcd": pcd_pieces,
-    **dict.fromkeys((".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts"), text_pieces),
+    **{".ply": lambda path: _ply(path), ".pcd": pcd_pieces},
+    **dict.fromkeys(TEXT, text_pieces),
     **dict.fromkeys((".npz", ".npy"), numpy_pieces),
     **dict.fromkeys((".las", ".laz"), las_pieces),
     ".spz": lambda path: iter([spz_columns(path)]),
 }
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
-MAGIC = (  # first bytes, and the kind that they tell; of kinds with several suffixes the file's own is kept
-    (b"ply", (".ply",)),
-    (b"glTF", (".glb",)),
-    (b"LASF", (".las", ".laz")),
-    (b"\x93NUMPY", (".npy",)),
-    (b"# .PCD", (".pcd",)),
-    (b"NGSP", (".spz",)),
+KNOWN = tuple(dict.fromkeys((*READERS, *MESHES)))
+NUMBER, BLANK = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
+# how a file begins, and the kind that this tells: of several the one that its own suffix names, else the first
+MAGIC = (
+    (rb"ply", (".ply",)),
+    (rb"glTF", (".glb",)),
+    (rb"LASF", (".las", ".laz")),
+    (rb"\x93NUMPY", (".npy",)),
+    (rb"# .PCD", (".pcd",)),
+    (rb"NGSP", (".spz",)),
+    (rb"\x1f\x8b|PK\x03\x04", ("", ".spz", ".npz", ".npy")),
 )
-ARCHIVES, PACKED = (b"\x1f\x8b", b"PK\3\4"), (".spz", ".npz", ".npy")  # first bytes, and kinds that begin with them
-COMMENTS = rb"(\s|#[^\n\r]*[\n\r])*"
-NUMBER = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
-TEXTS = (  # how text begins whose name may say otherwise
-    (rb"solid\b[^\0]*?\b(facet|endsolid)\b", ".stl"),
-    (COMMENTS + rb"(ST)?C?N?4?n?OFF\b", ".off"),
-    (COMMENTS + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", ".obj"),
-    (COMMENTS + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", ".xyz"),
+TEXTS = (
+    (rb"(?i)solid\b[^\0]*?\b(facet|endsolid)\b", (".stl",)),
+    (BLANK + rb"(ST)?C?N?4?n?OFF\b", (".off",)),
+    (BLANK + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", (".obj",)),
+    (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
@@ -68,8 +64,9 @@ FOREIGN: dict[bytes | str, tuple] = {
     ".e57": ("an E57 scan", None, CLOUDCOMPARE),
     **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
-    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz"), ("an archive", None, "unpack it first")),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz"), ("an archive", None, "unpack it first")),
+    **dict.fromkeys((b"\x1f\x8b", b"PK\3\4"), ("an archive", None, "unpack it first")),
 }
 
 
@@ -78,41 +75,35 @@ def kind_of(path: Path) -> str:
 
     The error names the format, its version and how to convert it.
     """
-    known = tuple(dict.fromkeys((*READERS, *MESHES)))
-    if path.is_dir():
-        raise UserError(f"{path}: a folder; expected a file of one of {' '.join(known)}")
-    suffix = path.suffix.lower()
+    suffix, known = path.suffix.lower(), f"expected one of {' '.join(KNOWN)}"
     if path.exists() and not path.is_file():
-        raise UserError(f"{path}: a pipe or a device; save what comes from it as a file")
-    if not path.is_file():
-        if suffix in known or suffix in FOREIGN:
-            raise UserError(f"{path}: there is no such file")
-        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
-    with path.open("rb") as file:
-        head = file.read(4096)
-    if not head and suffix in known:
-        raise UserError(f"{path}: the file is empty")
-    for magic, kinds in MAGIC:
-        if head.startswith(magic):
-            return suffix if suffix in kinds else kinds[0]
+        raise UserError(f"{path}: {'a folder' if path.is_dir() else 'a pipe or a device'}; {known}")
+    if not path.is_file() and (suffix in KNOWN or suffix in FOREIGN):
+        raise UserError(f"{path}: there is no such file")
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(4096)
+        if not head and suffix in KNOWN:
+            raise UserError(f"{path}: the file is empty")
+    if kind := _told_kind(MAGIC, head, suffix):
+        return kind
     for sign, (name, version, convert) in FOREIGN.items():
         if sign == suffix if isinstance(sign, str) else head.startswith(sign):
-            raise UserError(f"{path}: {name}{_version(head, version)}, which is not read: {convert}")
-    if head.startswith(ARCHIVES) and suffix not in PACKED:
-        raise UserError(f"{path}: an archive, which is not read: unpack it first")
-    text = next((kind for sign, kind in TEXTS if re.match(sign, head, re.IGNORECASE)), suffix)
-    if text not in known:
-        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected one of {' '.join(known)}")
-    return suffix if text == ".xyz" and (suffix == ".off" or READERS.get(suffix) is text_pieces) else text
+            found = struct.unpack_from(version, head) if version and len(head) >= struct.calcsize(version) else ()
+            words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
+            of_version = f" of version {'.'.join(words)}" if words else ""
+            raise UserError(f"{path}: {name}{of_version}, which is not read: {convert}")
+    kind = _told_kind(TEXTS, head, suffix) or suffix
+    if kind not in KNOWN:
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; {known}")
+    return kind
 
 
-def _version(head: bytes, form: str | None) -> str:
-    """The version that stands in the first bytes of a file: text, or numbers."""
-    if form is None or len(head) < struct.calcsize(form):
-        return ""
-    found = struct.unpack_from(form, head)
-    words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
-    return f" of version {'.'.join(words)}"
+def _told_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suffix: str) -> str:
+    """The kind that the first bytes of a file tell; empty if they tell none."""
+    kinds = next((kinds for sign, kinds in signs if re.match(sign, head)), ("",))
+    return suffix if suffix in kinds else kinds[0]
 
 
 def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:
@@ -135,7 +126,7 @@ def _ply(path: Path) -> Iterator[Columns]:
     """The columns of a .ply file, unpacked where it is one of compressed splats."""
     with path.open("rb") as file:
         header = read_ply_header(file)
-        fields = {name: {field for field, _ in properties} for name, _, properties in header.elements}
+        fields = {name: {field for field, *_ in properties} for name, _, properties in header.elements}
         if list(fields)[:2] == ["chunk", "vertex"] and "packed_position" in fields["vertex"]:
             (chunks, _), (packed, _) = read_elements(file, header, "chunk", "vertex").values()
             yield decompress_columns(chunks, packed)

@@ -23,47 +23,38 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import Columns
-
-# --- text -------------------------------------------------------------------------------------------------------------
-
+from spnr_jax.formats.columns import NORMAL, POSITION, Columns
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
-POSITION, COLOR, NORMAL = ("x", "y", "z"), ("r", "g", "b"), ("nx", "ny", "nz")
-PLAIN_COLUMNS = {3: POSITION, 4: (*POSITION, "intensity"), 8: (*POSITION, *COLOR, "roughness", "metallic")}
+COLOR = ("r", "g", "b")
 OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
 NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
+PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
+SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
 COMMENTS = ("#", "//")
-PIECE_LINES = 2**17  # in memory at a time
-SHOWN = 60  # characters of a line that an error shows
-LONGEST_HEADER = 4096  # characters in which names are looked for
-NUMBER = r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)"
-WITH_COMMA = r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?"
+NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;])")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)", re.IGNORECASE)  # as the libraries of Windows write it
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 INDEX = "index"  # the name of a column that only counts
-
-
-class Layout(NamedTuple):
-    """How a file writes its rows: what separates numbers (None: blanks), and whether commas are decimal points."""
-
-    delimiter: str | None
-    decimal_comma: bool
-
-    def plain(self, text: str) -> str:
-        """A row with decimal points, without separators behind the last number."""
-        text = text.rstrip(" \t" + (self.delimiter or ""))
-        if self.delimiter and EMPTY.search(text):
-            text = EMPTY.sub("nan", text)
-        return text.replace(",", ".") if self.decimal_comma else text
+MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
+PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
+ARRAY_COLUMNS = {
+    **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
+    **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
+    **dict.fromkeys(("colors", "rgb", "color"), COLOR),
+    **{name: (name,) for name in (*POSITION, *COLOR, *NORMAL, "red", "green", "blue", "intensity", "roughness")},
+    **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
+    **dict.fromkeys(("normals", "normal"), NORMAL),
+}
 
 
 def text_pieces(path: Path) -> Iterator[Columns]:
@@ -75,21 +66,28 @@ def text_pieces(path: Path) -> Iterator[Columns]:
         header, is_comment, first = _header(numbered)
         if not first[1]:
             raise UserError(f"holds 0 points: no row of numbers, only {header[:SHOWN]!r}")
-        layout = _layout(first[1])
+        delimiter = next((mark for mark in ";," if mark in first[1]), None)
+        parts = first[1].strip("; \t").split(";") if delimiter == ";" else first[1].split()
+        comma = len(parts) > 2 and "," in first[1] and all(WITH_COMMA.fullmatch(x.strip()) for x in parts if x)
+        delimiter = None if comma and delimiter == "," else delimiter
         lines = (
             (number, plain)
             for number, text in chain([first], numbered)
-            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := layout.plain(text))
+            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := _plain(text, delimiter, comma))
         )
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
-            count = len(rows[0][1].split(layout.delimiter))
-            table = load_text(rows, "line", count, layout.delimiter, ndmin=2)
-            names = names or _names(header, is_comment, table, layout)
-            if len(names) != table.shape[1]:
-                number, text = rows[0]
-                raise UserError(f"line {number}: expected {len(names)} numbers as before, found {text[:SHOWN]!r}")
+            count = len(names) or len(rows[0][1].split(delimiter))
+            table = load_text(rows, "line", count, delimiter, ndmin=2)
+            names = names or _names(header, is_comment, table)
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
+
+
+def _plain(text: str, delimiter: str | None, comma: bool) -> str:
+    """A row with decimal points, without separators behind the last number."""
+    text = text.rstrip(" \t" + (delimiter or ""))
+    text = EMPTY.sub("nan", text) if delimiter else text
+    return text.replace(",", ".") if comma else text
 
 
 def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
@@ -97,20 +95,11 @@ def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
     header, is_comment = "", True
     for number, line in lines:
         text = re.sub(r"^(#|//)\s*", "", line)
-        first = re.split(r"[\s;]+", text)[0]
-        if text and not re.fullmatch(NUMBER, first.split(",")[0], re.IGNORECASE):
+        if text and not NUMBER.fullmatch(re.split(r"[\s;,]+", text)[0]):
             header, is_comment = text[:LONGEST_HEADER], text != line
         elif text and text == line and not text.isdecimal():
             return header, is_comment, (number, line)
     return header, is_comment, (0, "")
-
-
-def _layout(row: str) -> Layout:
-    """How a row of numbers is written."""
-    delimiter = next((mark for mark in ";," if mark in row), None)
-    parts = row.strip("; \t").split(";") if delimiter == ";" else row.split()
-    comma = len(parts) > 2 and "," in row and all(re.fullmatch(WITH_COMMA, part.strip()) for part in parts if part)
-    return Layout(delimiter if delimiter == ";" or not comma else None, comma)
 
 
 def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
@@ -118,61 +107,63 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
 
     Undefined numbers of every kind are NaN.
     """
+
+    def load(texts: list[str]) -> np.ndarray:
+        table = np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
+        if "dtype" not in layout and table.shape[1] != count:
+            raise ValueError
+        return table
+
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
-        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
+        return load(texts)
     texts = [UNDEFINED.sub("nan", text) for text in texts]
-    try:
-        return np.loadtxt(texts, delimiter=delimiter, comments=None, **layout)
-    except ValueError:
-        for number, text in rows:
-            with contextlib.suppress(ValueError):
-                alone = np.loadtxt([UNDEFINED.sub("nan", text)], delimiter=delimiter, comments=None, **layout)
-                if "dtype" in layout or alone.shape[1] == count:
-                    continue
+    with contextlib.suppress(ValueError):
+        return load(texts)
+    for (number, text), plain in zip(rows, texts, strict=True):
+        try:
+            load([plain])
+        except ValueError:
             raise UserError(f"{what} {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
-        raise
+    raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 
-def _names(header: str, is_comment: bool, table: np.ndarray, layout: Layout) -> tuple[str, ...]:
+def _names(header: str, is_comment: bool, table: np.ndarray) -> tuple[str, ...]:
     """Names of the columns of a table from its header, or if that is a remark, from the numbers."""
-    count = table.shape[1]
+    count, names = table.shape[1], [""]
     plain = re.sub(r"[(\[][^)\]]*[)\]]", "", header)  # units
-    marks = [rf"\s*{mark}\s*" for mark in ";," if mark in plain]
-    found = [[name.strip("\"' \t").lower() for name in re.split(mark, plain)] for mark in (*marks, r"[\s,;]+")]
-    for names in found:
+    for mark in (*(mark for mark in ";," if mark in plain), r"[\s,;]+"):
+        names = [name.strip("\"' \t").lower() for name in re.split(mark, plain)]
         while len(names) > count and not names[-1]:
             names.pop()
         if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
             names.insert(0, "")  # as R writes a table
-    names = next((names for names in found if len(names) == count), found[-1])
-    named = "x" in names and len(names) == count
-    if not named and (is_comment or ("x" not in names and len(names) != count)):  # a remark
+        if len(names) == count:
+            break
+    known, fits = "x" in names, len(names) == count
+    if not (known and fits) and (is_comment or not (known or fits)):  # a remark
         return plain_names(table)
-    if len(names) != count:
+    if not fits:
         raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
     return tuple(name or INDEX for name in names)
 
 
 def plain_names(table: np.ndarray) -> tuple[str, ...]:
     """Names of the columns of a table (points, columns) that has none."""
-    if table.ndim == 2 and table.dtype.kind in NUMBERS:
-        count = table.shape[1]
-        if count in PLAIN_COLUMNS:
-            return PLAIN_COLUMNS[count]
-        if count == 6:
-            return (*POSITION, *(NORMAL if _are_normals(table[:, 3:]) else COLOR))
-        if count == 7:
-            alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
-            return (*POSITION, *((*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)))
-        if count == 9:
-            rest = (*NORMAL, *COLOR) if _are_normals(table[:, 3:6]) else (*COLOR, *NORMAL)
-            return (*POSITION, *rest)
-    raise UserError(
-        f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, 6, 7, "
-        "8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b nx ny nz), or "
-        "a header line that names the columns"
-    )
+    count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
+    first = NORMAL if count in (6, 9) and _are_normals(table[:, 3:6]) else COLOR
+    more = {3: (), 4: ("intensity",), 6: first, 8: (*COLOR, "roughness", "metallic")}
+    more[9] = (*first, *(NORMAL if first == COLOR else COLOR))
+    if count == 7:
+        alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
+        more[7] = (*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)
+    if count not in more:
+        raise UserError(
+            f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, "
+            "6, 7, 8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b and "
+            "nx ny nz), or a header line that names the columns"
+        )
+    return (*POSITION, *more[count])
 
 
 def _are_normals(vectors: np.ndarray) -> bool:
@@ -182,19 +173,6 @@ def _are_normals(vectors: np.ndarray) -> bool:
 
 
 # --- NumPy ------------------------------------------------------------------------------------------------------------
-
-
-HEADERS = threading.Lock()  # Python's parser, which NumPy reads headers with, fails in two threads at once (gh-106905)
-PIECE_BYTES = 2**25  # of an array in memory at a time
-MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
-ARRAY_COLUMNS = {
-    **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
-    **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
-    **dict.fromkeys(("colors", "rgb", "color"), COLOR),
-    **{name: (name,) for name in (*POSITION, *COLOR, *NORMAL, "red", "green", "blue", "intensity", "roughness")},
-    **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
-    **dict.fromkeys(("normals", "normal"), NORMAL),
-}
 
 
 def numpy_pieces(path: Path) -> Iterator[Columns]:
@@ -208,24 +186,21 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
     with refusing("is a broken, truncated or pickled NumPy file"), _parsing():
-        loaded = np.lib.format.open_memmap(path, mode="r")
-    rows = np.atleast_1d(loaded)
+        rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     if rows.ndim == 3:  # the pixels of a picture
         rows = rows.reshape(-1, rows.shape[2])
     names = rows.dtype.names or plain_names(rows)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
-        values = [piece[name] for name in names] if rows.dtype.names else piece.T
-        named = zip(names, values, strict=True)
+        named = zip(names, [piece[name] for name in names] if rows.dtype.names else piece.T, strict=True)
         yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
     """An .npz archive of arrays by their names."""
     stream = io.BytesIO()
-    save = np.savez_compressed if compressed else np.savez
-    save(stream, allow_pickle=False, **arrays)
+    (np.savez_compressed if compressed else np.savez)(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
 
 
@@ -248,7 +223,7 @@ def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) 
 @contextlib.contextmanager
 def _parsing() -> Iterator[None]:
     """Headers are read by one thread at a time; NumPy warns of those of Python 2, which it reads well."""
-    with HEADERS, warnings.catch_warnings():
+    with PARSER, warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
         yield
 
@@ -257,8 +232,7 @@ def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
     for name, array in archive.items():
-        targets = ARRAY_COLUMNS[name]
-        table = array[:, None] if array.ndim == 1 else array
+        targets, table = ARRAY_COLUMNS[name], array[:, None] if array.ndim == 1 else array
         if targets == COLOR and table.shape[1:] == (4,):
             targets = (*COLOR, "alpha")
         if targets == POSITION and table.shape[1:] != (3,):
@@ -266,8 +240,6 @@ def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
         if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
             raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
         columns |= dict(zip(targets, table.T, strict=True))
-    if "x" not in columns:
-        raise UserError(f"has no array named positions, points or xyz; found {', '.join(archive) or 'none'}")
     if len({len(column) for column in columns.values()}) > 1:
         raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
     return columns

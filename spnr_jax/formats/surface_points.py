@@ -1,14 +1,7 @@
 """Surface points with materials: normalisation of an object, and samples of its surface.
 
-Points are drawn uniformly by area over all parts, or spread evenly: each the farthest of several times as many from
-those before.  The material of each is looked up with the interpolation of the renderer (texels.py) and multiplied by
-the interpolated vertex colour; those that it cuts out are replaced.  `face` counts through all parts, as the renderer
-reports its hits.
-
-A texel of a normal map says where the normal points along the directions in which u grows, in which v falls (v runs
-down the rows, and the map's green is up), and outwards.  On a triangle the position is linear in the texture
-coordinates, so that two of its edges give both directions; they are made perpendicular to the interpolated normal.
-Where the coordinates have no area the normal stays.
+Points are drawn uniformly by area over all parts, or spread evenly.  The material of each is looked up with the
+interpolation of the renderer and multiplied by the interpolated vertex colour; points that it cuts out are replaced.
 """
 
 from dataclasses import replace
@@ -17,8 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import CHANNELS, TEXTURES, Asset, Part, RejectedAsset, lookup
+from spnr_jax.formats.assets import CHANNELS, Asset, Part, lookup
 from spnr_jax.kernels.cloud_arrays import farthest_points
+from spnr_jax.kernels.triangles import face_crosses, tilt_normals, unit
 
 Spread = Literal["random", "even"]
 MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it counts as nowhere
@@ -37,16 +31,16 @@ class SurfacePoints(NamedTuple):
 
 
 def bounding_box(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner (3,) of the vertices that faces use; RejectedAsset where there is no such box."""
+    """Lowest and highest corner (3,) of the vertices that faces use; UserError where there is no such box."""
     corners = [part.positions[part.faces.ravel()] for part in asset.parts if len(part.faces)]
     if not corners:
-        raise RejectedAsset("has no faces")
+        raise UserError("has no faces")
     used = np.concatenate(corners)
     if not np.isfinite(used).all():
-        raise RejectedAsset("has vertices that are not finite (NaN or infinity)")
+        raise UserError("has vertices that are not finite (NaN or infinity)")
     low, high = used.min(axis=0), used.max(axis=0)
     if not np.linalg.norm(high - low) > 0:
-        raise RejectedAsset("has zero extent: all its vertices lie in one point")
+        raise UserError("has zero extent: all its vertices lie in one point")
     return low, high
 
 
@@ -82,36 +76,26 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.concatenate([face_areas(part) for part in asset.parts]))
     if not cumulative[-1] > 0:
-        raise RejectedAsset("has no face with an area")
-    rounds: list[dict[str, np.ndarray]] = []
-    found = 0
-    while found < num_points:
-        if len(rounds) == MOST_ROUNDS:
-            raise RejectedAsset("has next to no surface that its textures do not cut out")
-        columns = _draw_points(asset, cumulative, num_points, rng)
-        solid = columns.pop("solid")
-        found += int(np.count_nonzero(solid))
-        rounds.append({name: values[solid] for name, values in columns.items()})
-    return SurfacePoints(**{name: np.concatenate([r[name] for r in rounds])[:num_points] for name in rounds[0]})
-
-
-def _draw_points(
-    asset: Asset, cumulative: np.ndarray, num_points: int, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """The columns of SurfacePoints of random points on all faces, and whether there is surface at them: `solid`."""
-    face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
-    face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
-    barycentric = _uniform_barycentric(rng.random((num_points, 2)))
+        raise UserError("has no face with an area")
     first_face = np.cumsum([0, *(len(part.faces) for part in asset.parts)])
-    columns: dict[str, np.ndarray]
-    columns = {name: np.zeros((num_points, 3), np.float32) for name in ("positions", "normals", "base_color")}
-    columns |= {name: np.zeros(num_points, np.float32) for name in ("roughness", "metallic")}
-    columns["solid"] = np.ones(num_points, bool)
-    for part, first in zip(asset.parts, first_face, strict=False):
-        here = (face >= first) & (face < first + len(part.faces))
-        for name, values in _sample_part(part, face[here] - first, barycentric[here]).items():
-            columns[name][here] = values
-    return columns | {"face": face.astype(np.int32)}
+    rounds: list[SurfacePoints] = []
+    while sum(len(points.face) for points in rounds) < num_points:
+        if len(rounds) == MOST_ROUNDS:
+            raise UserError("has next to no surface that its textures do not cut out")
+        face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
+        face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
+        root, along = rng.random((num_points, 2)).T ** [[0.5], [1]]
+        barycentric = np.stack([1 - root, root * (1 - along), root * along], axis=-1)  # uniform over the triangle
+        vectors, values = np.zeros((3, num_points, 3), np.float32), np.zeros((2, num_points), np.float32)
+        points = SurfacePoints._make([*vectors, *values, face.astype(np.int32)])
+        solid = np.ones(num_points, bool)
+        for part, first in zip(asset.parts, first_face, strict=False):
+            here = (face >= first) & (face < first + len(part.faces))
+            sampled, solid[here] = _sample_part(part, face[here] - first, barycentric[here])
+            for name, column in sampled.items():
+                getattr(points, name)[here] = column
+        rounds.append(SurfacePoints(*(column[solid] for column in points)))
+    return SurfacePoints(*(np.concatenate(columns)[:num_points] for columns in zip(*rounds, strict=True)))
 
 
 def face_areas(part: Part) -> np.ndarray:
@@ -119,69 +103,25 @@ def face_areas(part: Part) -> np.ndarray:
     return np.linalg.norm(face_crosses(part.positions, part.faces), axis=-1) / 2
 
 
-def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> dict[str, np.ndarray]:
-    """Every column but `face` that `_draw_points` gives, at barycentric coordinates (n, 3) of local faces (n,)."""
+def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The columns of SurfacePoints but `face`, and whether there is surface, at barycentric (n, 3) of faces (n,)."""
+    corners, look = part.faces[face], part.material
 
     def interpolate(values: np.ndarray) -> np.ndarray:
-        return np.einsum("nk,nkc->nc", barycentric, values[part.faces[face]])
+        return np.einsum("nk,nkc->nc", barycentric, values[corners])
 
     texcoords = None if part.texcoords is None else interpolate(part.texcoords)
-    channels = {}
-    for name, axes in (CHANNELS | TEXTURES).items():
-        values = getattr(part.material, name)
-        if np.ndim(values) > axes:
+    found = {name: np.asarray(values) for name in CHANNELS if (values := getattr(look, name)) is not None}
+    for name, values in found.items():
+        if values.ndim > CHANNELS[name]:
             assert texcoords is not None, "a texture needs texture coordinates"
-            channels[name] = lookup(values, texcoords, part.material.wrap)
-        elif values is not None:
-            channels[name] = np.broadcast_to(values, (len(face), *np.shape(values)))
-    opacity, normal_map = (channels.pop(name, None) for name in TEXTURES)
+            found[name] = lookup(values, texcoords, look.wrap)
+    opacity, normal_map = found.pop("opacity", None), found.pop("normal_map", None)
     if part.colors is not None:
-        channels["base_color"] = channels["base_color"] * interpolate(part.colors)
-    geometric = unit(face_crosses(part.positions, part.faces[face]))
+        found["base_color"] = found["base_color"] * interpolate(part.colors)
+    geometric = unit(face_crosses(part.positions, corners))
     normals = geometric if part.normals is None else unit(interpolate(part.normals), geometric)
     if normal_map is not None and part.texcoords is not None:
-        corners = part.faces[face]
         normals = tilt_normals(normals, normal_map, part.positions[corners], part.texcoords[corners])
-    solid = np.ones(len(face), bool) if opacity is None else opacity >= part.material.cutoff
-    return {"positions": interpolate(part.positions), "normals": normals, "solid": solid, **channels}
-
-
-def _uniform_barycentric(uniform: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (n, 3), uniform over the triangle, of uniform numbers (n, 2)."""
-    root = np.sqrt(uniform[:, :1])
-    return np.concatenate([1 - root, root * (1 - uniform[:, 1:]), root * uniform[:, 1:]], axis=-1)
-
-
-def face_crosses(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals (f, 3) of twice the triangles' area."""
-    a, b, c = np.moveaxis(positions[faces], 1, 0)
-    return np.cross(b - a, c - a)
-
-
-def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit mean normals (v, 3) of the faces (f, 3) around each vertex, weighted by area; y where there is none."""
-    sums = np.zeros_like(positions)
-    np.add.at(sums, faces, face_crosses(positions, faces)[:, None])
-    return unit(sums, np.array([0.0, 1.0, 0.0]))
-
-
-def unit(vectors: np.ndarray, fallback: np.ndarray | None = None) -> np.ndarray:
-    """Vectors (n, 3) of length 1; where one has no length, the fallback."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    directed = vectors / np.where(length > 0, length, 1)
-    return directed if fallback is None else np.where(length > 0, directed, fallback)
-
-
-def tilt_normals(normals: np.ndarray, texels: np.ndarray, corners: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) tilted by texels (n, 3), on triangles with corners (n, 3, 3) and texcoords (n, 3, 2)."""
-    edges, steps = corners[:, 1:] - corners[:, :1], texcoords[:, 1:] - texcoords[:, :1]
-    area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
-    side = np.where(area < 0, -1.0, 1.0)[:, None]  # the length does not matter, so that nothing is divided by the area
-    along_u = side * (edges[:, 0] * steps[:, 1, 1, None] - edges[:, 1] * steps[:, 0, 1, None])
-    against_v = side * (edges[:, 0] * steps[:, 1, 0, None] - edges[:, 1] * steps[:, 0, 0, None])
-    tangent = unit(along_u - normals * np.sum(along_u * normals, axis=-1, keepdims=True))
-    across = np.cross(normals, tangent)
-    across *= np.where(np.sum(across * against_v, axis=-1, keepdims=True) < 0, -1, 1)
-    found = unit(texels[:, :1] * tangent + texels[:, 1:2] * across + texels[:, 2:] * normals)
-    sound = (area != 0) & np.isfinite(found).all(axis=-1) & tangent.any(axis=-1) & found.any(axis=-1)
-    return np.where(sound[:, None], found, normals)
+    solid = np.ones(len(face), bool) if opacity is None else opacity >= look.cutoff
+    return {"positions": interpolate(part.positions), "normals": normals, **found}, solid

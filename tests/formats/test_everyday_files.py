@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.gltf_files import GltfBuilder
-from support.point_clouds import BALL, GREEN, LINEAR, ply_bytes, read, write, write_rows
+from support.point_clouds import BALL, GREEN, LINEAR, read, write, write_rows
 
 from spnr_jax.config import Cut
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.polygons import ears
+from spnr_jax.kernels.triangles import ears
 from spnr_jax.surfels.sides import spiral
 
 ROOT = Path(__file__).parents[2]
@@ -179,58 +179,37 @@ def test_points_without_colour_among_others_take_that_of_their_neighbours_and_bl
 # What other columns say
 
 PART = np.arange(420) % 3 == 0
+F_DC = dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"), np.zeros(420))  # of splats
+HIDDEN, BROKEN = r"140 of 420 points left out: .* \(--keep-noise keeps them\)", "140 of 420 points left out: NaN"
+SEEN = {  # columns of the ball, points that are left, what a line says
+    "alpha": ({"alpha": np.where(PART, 0, 255).astype(np.uint8)}, ~PART, HIDDEN),
+    "opacity": ({"opacity": np.where(PART, 0.001, 0.9)}, ~PART, HIDDEN),
+    "opacity before the logistic function": ({"opacity": np.where(PART, -6.0, 3.0)}, ~PART, HIDDEN),
+    "noise of CloudCompare": ({"scalar_Classification": np.where(PART, 7.0, 2.0)}, ~PART, HIDDEN),
+    "noise": ({"classification": np.where(PART, 18, 6).astype(np.uint8)}, ~PART, HIDDEN),
+    "withheld": ({"withheld": PART.astype(np.uint8)}, ~PART, HIDDEN),
+    "alpha 0 everywhere": ({"alpha": np.zeros(420, np.uint8)}, ..., "red green blue taken"),
+    "noise everywhere": ({"classification": np.full(420, 7, np.uint8)}, ..., "all points kept, though"),
+    "splats without a number": (F_DC | {"opacity": np.where(PART, np.nan, 3.0)}, ~PART, BROKEN),
+    "activated splats": (F_DC | {"opacity": np.where(PART, 0.1, 0.9)}, ~PART, HIDDEN),
+    "half transparent splats": (F_DC | {"opacity": np.full(420, 0.5)}, ..., "red green blue taken"),
+    "splats of 0 and 1": (F_DC | {"opacity": np.where(PART, -np.inf, np.inf)}, ~PART, HIDDEN),
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "column"),
-    [
-        ("alpha", np.where(PART, 0, 255).astype(np.uint8)),
-        ("opacity", np.where(PART, 0.001, 0.9)),
-        ("opacity", np.where(PART, -6.0, 3.0)),
-        ("scalar_Classification", np.where(PART, 7.0, 2.0)),
-        ("classification", np.where(PART, 18, 6).astype(np.uint8)),
-        ("withheld", PART.astype(np.uint8)),
-    ],
-)
-def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_path, name, column):
-    path = colored_ball(tmp_path, **{name: column})
+@pytest.mark.parametrize("case", SEEN)
+def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_path, case):
+    columns, left, words = SEEN[case]
+    path = colored_ball(tmp_path, **columns)
     cloud, lines = read(path)
-    np.testing.assert_allclose(cloud.positions, BALL[~PART], atol=1e-6)
-    assert any(re.match(r"140 of 420 points left out: .* \(--keep-noise keeps them\)", line) for line in lines)
-    assert len(read_cloud(path, cut=Cut(keep_noise=True)).positions) == 420
+    np.testing.assert_allclose(cloud.positions, BALL[left], atol=1e-6)
+    assert any(re.match(words, line) for line in lines)
+    kept = read_cloud(path, cut=Cut(keep_noise=True)).positions
+    assert len(kept) == (280 if words == BROKEN else 420)
 
 
-def test_an_alpha_of_0_everywhere_noise_everywhere_and_black_everywhere_are_kept(tmp_path):
-    for column in ({"alpha": np.zeros(420, np.uint8)}, {"classification": np.full(420, 7, np.uint8)}):
-        assert len(read_cloud(colored_ball(tmp_path, **column)).positions) == 420
+def test_a_line_says_that_the_picture_will_be_black(tmp_path):
     assert any("nearly black" in line for line in read(colored_ball(tmp_path, 3, "u1"))[1])
-
-
-def test_splats_whose_opacity_is_not_a_number_or_is_activated_already_are_told(tmp_path):
-    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    properties = [(name, "float") for name in names]
-    opacities = (np.where(PART, np.nan, 3.0), 280), (np.where(PART, 0.1, 0.9), 280), (np.full(420, 0.5), 420)
-    opacities += ((np.where(PART, -np.inf, np.inf), 280),)
-    for opacity, left in opacities:
-        rows = [tuple(row) for row in np.column_stack([BALL, np.zeros((420, 3)), opacity])]
-        content = ply_bytes("binary_little_endian", rows=rows, properties=properties)
-        assert len(read_cloud(write(tmp_path, "a.ply", content)).positions) == left
-
-
-@pytest.mark.parametrize(
-    ("normals", "reason"),
-    [
-        (np.tile([0.0, 0, 1], (420, 1)), "all are the same"),
-        (spiral(420)[:, [1, 2, 0]] * [1, -1, 1], "lie across the surface"),
-        (spiral(420), None),
-        (-spiral(420), None),
-    ],
-)
-def test_normals_are_left_out_where_the_points_speak_against_them(tmp_path, normals, reason):
-    columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
-    cloud, lines = read(colored_ball(tmp_path, **columns))
-    assert (cloud.normals is None) == (reason is not None)
-    assert reason is None or any(line.startswith("normals of the file left out") and reason in line for line in lines)
 
 
 # Precision, repeats
@@ -254,27 +233,35 @@ def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
         np.testing.assert_allclose(back, 0.3 * BALL + UTM, rtol=0, atol=1e-6)
 
 
-ROUNDED = np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]])
-SAID = {  # positions, what a line about them says
+ROUNDED, LEFT_OUT = (
+    np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]]),
+    "normals of the file left out: ",
+)
+FLAT, SHORT = BALL * [50, 0.05, 50] + [0, 3e3, 0], r"only \d+ distinct values along y: the file's"
+ACROSS = spiral(420)[:, [1, 2, 0]] * [1, -1, 1]
+SAID = {  # positions and perhaps normals, what a line about them says
     "degrees": (BALL * [5e-5, 5e-5, 8] + [8.5, 47.1, 400], "x and y look like degrees"),
     "a handful": (BALL[:5], "5 points alone tell next to no surface"),
     "many more": (BALL[:50], None),
     "rounded": (ROUNDED, "only 7 distinct values along y, 414 along another axis: is it rounded?"),
-    "short floats": (
-        (BALL * [50, 0.05, 50] + [0, 3e3, 0]).astype("f4"),
-        r"only \d+ distinct values along y: the file's",
-    ),
+    "short floats": (FLAT.astype("f4"), SHORT),
     "short floats of a large ball": ((BALL + [0, 3e3, 0]).astype("f4"), None),
+    "one normal": (np.column_stack([BALL, np.tile([0.0, 0, -1], (420, 1))]), f"{LEFT_OUT}all are the same"),
+    "normals across": (np.column_stack([BALL, ACROSS]), f"{LEFT_OUT}they lie across the surface"),
+    "normals outwards": (np.column_stack([BALL, spiral(420)]), None),
+    "normals inwards": (np.column_stack([BALL, -spiral(420)]), None),
 }
 
 
 @pytest.mark.parametrize("case", SAID)
-def test_a_line_says_what_looks_wrong_with_positions(tmp_path, case):
-    positions, words = SAID[case]
-    np.save(tmp_path / "a.npy", positions)
-    lines = [line for line in read(tmp_path / "a.npy")[1] if not line.startswith(("no ", "moved by"))]
+def test_a_line_says_what_looks_wrong_with_positions_and_normals_which_are_left_out(tmp_path, case):
+    table, words = SAID[case]
+    np.save(tmp_path / "a.npy", table)
+    cloud, lines = read(tmp_path / "a.npy")
+    lines = [line for line in lines if not line.startswith(("no ", "moved by"))]
     assert bool(lines) == bool(words)
     assert not words or any(re.match(words, line) for line in lines)
+    assert (cloud.normals is None) == (table.shape[1] == 3 or bool(words))
 
 
 def test_a_mesh_of_short_floats_far_away_is_refused(tmp_path):

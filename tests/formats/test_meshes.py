@@ -1,55 +1,29 @@
-"""Mesh folders and files: ids, the formats without materials, and real files where they are at hand."""
+"""Meshes without materials, OBJ with MTL, what lets light through or is missing, and real files."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
-from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder
+from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder
+from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent, obj_leaf, refusal, write_obj
 
 from data_gen.plan.sources import find_meshes
-from spnr_jax.formats.assets import RejectedAsset
+from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
-FACES = SQUARE.reshape(2, 3)
-
-
-def write(path, text=""):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    return path
-
-
-def ids(folder, *names):
-    for name in names:
-        write(folder / name)
-    return {identifier: str(path.relative_to(folder)) for identifier, path in find_meshes(folder)}
-
-
-def test_ids_are_stems_or_the_folder_of_a_lone_obj_or_gltf(tmp_path):
-    found = ids(tmp_path, "b.glb", "a.PLY", "pan/model.obj", "pan/model.mtl", "lamp/scene.gltf", "x/cup.glb")
-    expected = {"a": "a.PLY", "b": "b.glb", "cup": "x/cup.glb", "lamp": "lamp/scene.gltf", "pan": "pan/model.obj"}
-    assert list(found.items()) == list(expected.items())
-
-
-def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(tmp_path):
-    found = ids(tmp_path, "a b.glb", "a_b.glb", "a?b.glb", "A_B.GLB", "ä.off", "ö.off", "a_b.glb.ply")
-    assert len(found) == 7
-    assert len({name.casefold() for name in found}) == 7
-    assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABGLP._-0123456789") for name in found)
-    assert all(name[0] not in "._-" for name in found)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "stl_ascii", "off", "obj"])
 def test_geometry_without_materials_is_grey_half_rough_and_no_metal(tmp_path, suffix):
-    path = tmp_path / f"a.{suffix.removesuffix('_ascii')}"
-    trimesh.Trimesh(CORNERS, FACES, process=False).export(path, file_type=suffix)
+    path, faces = tmp_path / f"a.{suffix.removesuffix('_ascii')}", SQUARE.reshape(2, 3)
+    trimesh.Trimesh(CORNERS, faces, process=False).export(path, file_type=suffix)
     (part,) = load_mesh(path).parts
     found = {tuple(map(tuple, triangle)) for triangle in part.positions[part.faces]}
-    assert found == {tuple(map(tuple, triangle)) for triangle in CORNERS[FACES].astype(float)}
+    assert found == {tuple(map(tuple, triangle)) for triangle in CORNERS[faces].astype(float)}
     np.testing.assert_array_equal(part.material.base_color, [0.5, 0.5, 0.5])
     assert (part.material.roughness, part.material.metallic) == (0.5, 0)
 
@@ -66,6 +40,8 @@ def test_unused_vertices_go_and_normals_become_unit(tmp_path):
     assert asset.ignored == ("some normals without a direction (the faces' are used)",)
 
 
+# Real files
+
 REAL = pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real mesh files is not beside this checkout")
 REFUSED = {  # as references
     "blend_muscle_car": "is transparent: material 'Lamp_glass.003' has alphaMode BLEND",
@@ -80,7 +56,7 @@ def test_each_hard_file_is_read_or_refused_with_the_right_reason():
     assert len(found) == 10
     for name, path in found.items():
         if name in REFUSED:
-            with pytest.raises(RejectedAsset, match=REFUSED[name]):
+            with pytest.raises(UserError, match=REFUSED[name]):
                 load_mesh(path)
             continue
         points = sample_surface(normalise(load_mesh(path))[0], 256, 0)
@@ -102,6 +78,92 @@ def test_geometry_agrees_with_trimesh(name):
     assert area == pytest.approx(theirs.area, rel=1e-5)
 
 
+# OBJ and MTL
+
+PAINTED = f"{VERTICES}usemtl paint\nf 1 2 3 4\n"
+TEXTURED = f"{VERTICES}{TEXCOORDS}vn 0 0 2\nusemtl paint\nf 1/1/1 2/2/1 3/3/1 4/4/1\n"
+
+
+SQUARES = "f 1 2 3 4\n", "f 1 2 3\nf 1 3 4\n", "f -4 -3 -2 -1\n", "\tf\t1 2 3\n  f 1 3 4\n", "f 1 2 3 \\\n4\n"
+
+
+@pytest.mark.parametrize("faces", SQUARES)
+def test_every_way_to_write_a_square_gives_it_and_relative_numbers_count_from_where_they_stand(tmp_path, faces):
+    (part,) = load_mesh(
+        write_obj(tmp_path, VERTICES + faces + VERTICES.replace(" 0\n", " 5\n") + "f -4 -3 -2 -1\n")
+    ).parts
+    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
+    np.testing.assert_allclose(np.cross(b - a, c - a), [[0, 0, 1]] * 4)
+    assert {tuple(p) for p in part.positions} == {(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 5)}
+    assert part.normals is None
+
+
+def test_normals_are_kept_and_v_is_counted_from_above(tmp_path):
+    (part,) = load_mesh(write_obj(tmp_path, TEXTURED, "newmtl paint\nmap_Kd pine.png\n")).parts
+    np.testing.assert_array_equal(part.normals, [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(part.texcoords, np.stack([part.positions[:, 0], 1 - part.positions[:, 1]], axis=-1))
+
+
+LINEAR = srgb_to_linear(CHECKER / 255)
+PLACEHOLDER = "Kd 0.8 0.8 0.8\nmap_Kd -s 2 -.5 1e-1 -clamp on 3d wood.png"
+LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ignored
+    (PLACEHOLDER, (LINEAR, 0.5, 0, "clamp"), ("MTL Kd beside map_Kd", "MTL map option -s")),
+    ("Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10", (np.float32([0.1, 0.2, 0.3]), 0.25, 0.75, "repeat"), ()),
+    ("Kd 0.1 0.2 0.3\nNs 98\nd 1\nTr 0", (np.float32([0.1, 0.2, 0.3]), np.sqrt(2 / 100), 0, "repeat"), ()),
+    ("Kd 0.1 0.2 0.3\nTr 1.000\nd 1.0", (np.float32([0.1, 0.2, 0.3]), 0.5, 0, "repeat"), ()),
+]
+
+
+@pytest.mark.parametrize(("mtl", "expected", "ignored"), LOOKS)
+def test_an_opaque_material_has_its_colour_or_texture_and_the_roughness_of_pr_or_of_the_exponent(
+    tmp_path, mtl, expected, ignored
+):
+    asset = load_mesh(write_obj(tmp_path, TEXTURED, f"newmtl paint\n{mtl}\n"))
+    look, (color, roughness, metallic, wrap) = asset.parts[0].material, expected
+    np.testing.assert_allclose(look.base_color, color, rtol=0, atol=1e-6 if color.ndim > 1 else 0)
+    np.testing.assert_allclose([look.roughness, look.metallic], [roughness, metallic], rtol=1e-6)
+    assert (look.wrap, asset.ignored) == (wrap, ignored)
+
+
+def test_two_materials_with_odd_names_make_two_parts(tmp_path):
+    text = VERTICES + "usemtl dark wood #2\nf 1 2 3\nusemtl usemtl \nf 1 3 4\n"
+    parts = load_mesh(write_obj(tmp_path, text, "newmtl dark wood #2\nKd 0.25 0 0\nnewmtl usemtl\nKd 0 0 0.5\n")).parts
+    look = {tuple(part.material.base_color): part.positions.tolist() for part in parts}
+    assert look == {(0.25, 0, 0): [[0, 0, 0], [1, 0, 0], [1, 1, 0]], (0, 0, 0.5): [[0, 0, 0], [1, 1, 0], [0, 1, 0]]}
+
+
+def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whatever_their_order(tmp_path):
+    back = VERTICES.replace("v 1 0 0", "v 1 0 0\nv 1 0 0")  # vertex 3 is vertex 2 again
+    text = back + "usemtl red\nf 1 2 4\nusemtl blue\nf 4 3 1\nf 1 4 5\n"
+    asset = load_mesh(write_obj(tmp_path, text, "newmtl blue\nKd 0 0 1\nnewmtl red\nKd 1 0 0\n"))
+    assert {tuple(p.material.base_color): len(p.faces) for p in asset.parts} == {(1, 0, 0): 1, (0, 0, 1): 1}
+    assert asset.ignored == ("1 doubled faces (one of each is kept)",)
+
+
+TRANSPARENT = "d 0.5", "d -halo 0.9", "d 0", "Tr 0.3", "map_d mask.png"
+BROKEN = [  # text, library, words of the refusal
+    *((PAINTED, f"newmtl paint\n{line}\n", "is transparent: material 'paint'") for line in TRANSPARENT),
+    *((PAINTED, f"newmtl paint\n{line}\n", "not finite") for line in ("Kd nan 0 0", "Pm nan")),
+    (PAINTED, "newmtl paint\nmap_Kd gone.png\n", "missing: 'gone.png'"),
+    (PAINTED, "newmtl paint\nmap_Kd ..\\gone.png\n", "outside its own folder"),
+    (PAINTED, "newmtl other\n", "'paint'"),
+    (f"mtllib gone.mtl\n{VERTICES}f 1 2 3\n", None, "missing: 'gone.mtl'"),
+    (VERTICES, None, "has no faces"),
+    ("", None, "has no faces"),
+    (VERTICES.replace("1 1 0", "1 nan 0") + "f 1 2 3\n", None, "not finite"),
+    (VERTICES + "f 1 2 9\n", None, "name v 9 of 4: broken"),
+    (VERTICES.replace("1 1 0", "1 1") + "f 1 2 3\n", None, "broken"),
+    (VERTICES + "f -5 2 3\n", None, "before the first"),
+    (VERTICES.replace("1 1 0", "1 x 0") + "f 1 2 3\n", None, "broken"),
+    (VERTICES + "f 1 1 3\n", None, "no face with an area"),
+]
+
+
+@pytest.mark.parametrize(("text", "mtl", "words"), BROKEN)
+def test_what_is_transparent_missing_or_broken_is_refused_in_one_line(tmp_path, text, mtl, words):
+    assert words in refusal(write_obj(tmp_path, text, mtl))
+
+
 # For pictures, transparent parts are drawn or left out and missing images are gone without; for references neither
 
 CUT = "surface only where the alpha of the texture reaches its cut-off: 'leaf'"
@@ -113,38 +175,6 @@ MASK, BLEND = {"alphaMode": "MASK"}, {"alphaMode": "BLEND"}
 ALL, HALF, NONE = 1 / 2, 1 / 3, 0  # share of the points on a square beside a whole one, of which so much is there
 
 
-def half_transparent(low=0, high=255):
-    """Texels red throughout, whose left half has one alpha and whose right half another."""
-    texels = np.zeros((8, 8, 4), np.uint8)
-    texels[..., 0] = 255
-    texels[..., 3] = np.where(np.arange(8) < 4, low, high)
-    return texels
-
-
-def gltf(folder, texels=None, factor=1.0, material=()):
-    """A file of an opaque blue square far away and one of the material under test."""
-    builder = GltfBuilder()
-    blue = builder.material(pbrMetallicRoughness={"baseColorFactor": [0, 0, 1, 1]})
-    builder.mesh(builder.primitive(material=blue), translation=[10, 0, 0])
-    pbr = {"baseColorFactor": [1, 1, 1, factor]}
-    if texels is not None:
-        pbr["baseColorTexture"] = {"index": builder.texture(texels, wrapS=33071, wrapT=33071)}
-    tested = builder.material(name="leaf", pbrMetallicRoughness=pbr, **dict(material))
-    builder.mesh(builder.primitive(material=tested, TEXCOORD_0=UV))
-    return builder.write(folder / "two.glb")
-
-
-def obj(folder, statement, texels=None):
-    """The same as OBJ and MTL."""
-    if texels is not None:
-        Image.fromarray(texels).save(folder / "mask.png")
-    (folder / "look.mtl").write_text(f"newmtl leaf\n{statement}\nnewmtl plain\nKd 0 0 1\n")
-    corners = "".join(f"v {x + a} {y} 0\n" for a in (0, 10) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    faces = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl leaf\nf 1/1 2/2 3/3 4/4\nusemtl plain\nf 5/1 6/2 7/3 8/4\n"
-    (folder / "a.obj").write_text(f"mtllib look.mtl\n{corners}{faces}")
-    return folder / "a.obj"
-
-
 def share_of_tested(asset, spread="random"):
     points = sample_surface(asset, 900, 0, spread).positions
     assert len(points) == 900
@@ -153,21 +183,19 @@ def share_of_tested(asset, spread="random"):
 
 
 CASES = {  # writer, its arguments; share and note for `opaque` and for `skip`
-    "mask": (gltf, (half_transparent(100, 200), 1.0, MASK), (HALF, CUT), (HALF, CUT)),
-    "mask that hides nothing": (gltf, (half_transparent(200, 200), 1.0, MASK), (ALL, None), (ALL, None)),
-    "mask that hides all": (gltf, (half_transparent(200, 200), 0.1, MASK), (NONE, BELOW), (NONE, BELOW)),
-    "glass of a factor": (gltf, (None, 0.2, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "glass that transmits": (gltf, (None, 1.0, GLASS), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "glass of texels": (gltf, (half_transparent(60, 60), 1.0, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "empty space around blended leaves": (
-        gltf, (half_transparent(5, 200), 1.0, BLEND), (HALF, DRAWN), (HALF, LEFT_OUT),
-    ),
-    "blended in name alone": (gltf, (half_transparent(255, 255), 1.0, BLEND), (ALL, None), (ALL, None)),
-    "OBJ's d": (obj, ("Kd 1 0 0\nd 0.3",), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "OBJ's Tr": (obj, ("Kd 1 0 0\nTr 0.8",), (ALL, DRAWN), (NONE, LEFT_OUT)),
-    "grey map_d": (obj, ("map_d -clamp on mask.png", half_transparent()[..., 3]), (HALF, CUT), (HALF, CUT)),
-    "alpha of map_d": (obj, ("map_d -clamp on mask.png", half_transparent()), (HALF, CUT), (HALF, CUT)),
-}  # fmt: skip
+    "mask": (gltf_leaf, (half_transparent(100, 200), 1.0, MASK), (HALF, CUT), (HALF, CUT)),
+    "mask that hides nothing": (gltf_leaf, (half_transparent(200, 200), 1.0, MASK), (ALL, None), (ALL, None)),
+    "mask that hides all": (gltf_leaf, (half_transparent(200, 200), 0.1, MASK), (NONE, BELOW), (NONE, BELOW)),
+    "glass of a factor": (gltf_leaf, (None, 0.2, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "glass that transmits": (gltf_leaf, (None, 1.0, GLASS), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "glass of texels": (gltf_leaf, (half_transparent(60, 60), 1.0, BLEND), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "space around blended leaves": (gltf_leaf, (half_transparent(5, 200), 1.0, BLEND), (HALF, DRAWN), (HALF, LEFT_OUT)),
+    "blended in name alone": (gltf_leaf, (half_transparent(255, 255), 1.0, BLEND), (ALL, None), (ALL, None)),
+    "OBJ's d": (obj_leaf, ("Kd 1 0 0\nd 0.3",), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "OBJ's Tr": (obj_leaf, ("Kd 1 0 0\nTr 0.8",), (ALL, DRAWN), (NONE, LEFT_OUT)),
+    "grey map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()[..., 3]), (HALF, CUT), (HALF, CUT)),
+    "alpha of map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()), (HALF, CUT), (HALF, CUT)),
+}
 
 
 @pytest.mark.parametrize("parts", ["opaque", "skip"])
@@ -181,25 +209,18 @@ def test_what_lets_light_through_is_drawn_cut_out_or_left_out_and_said(tmp_path,
     assert left > 0.5 - 1 / 8 or share != HALF
     assert asset.notes == ((note,) if note else ())
     assert share_of_tested(asset, "even")[0] > 0 or share == NONE
-    if note or writer is gltf:
-        with pytest.raises(RejectedAsset, match="is transparent: material 'leaf'"):
+    if note or writer is gltf_leaf:
+        with pytest.raises(UserError, match="is transparent: material 'leaf'"):
             load_mesh(path)
 
 
 def test_an_object_of_which_nothing_is_left_says_why(tmp_path):
-    builder = GltfBuilder()
-    material = builder.material(name="glass", alphaMode="BLEND", pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0]})
-    builder.mesh(builder.primitive(material=material))
-    with pytest.raises(RejectedAsset, match="has nothing to draw: transparent parts left out .* 'glass'"):
-        load_mesh(builder.write(tmp_path / "glass.glb"), transparent_parts="skip")
+    with pytest.raises(UserError, match="has nothing to draw: transparent parts left out .* 'leaf'"):
+        load_mesh(gltf_leaf(tmp_path, None, 0.0, BLEND, alone=True), transparent_parts="skip")
     nearly = half_transparent(0, 0)
     nearly[0, 0, 3] = 255
-    builder = GltfBuilder()
-    pbr = {"baseColorTexture": {"index": builder.texture(nearly)}}
-    holes = builder.material(alphaMode="MASK", pbrMetallicRoughness=pbr)
-    builder.mesh(builder.primitive(material=holes, TEXCOORD_0=UV / 4 + 0.5))
-    asset = load_mesh(builder.write(tmp_path / "holes.glb"), transparent_parts="opaque")
-    with pytest.raises(RejectedAsset, match="next to no surface"):
+    asset = load_mesh(gltf_leaf(tmp_path, nearly, 1.0, MASK, UV / 4 + 0.5, alone=True), transparent_parts="opaque")
+    with pytest.raises(UserError, match="next to no surface"):
         sample_surface(asset, 20, 0)
 
 
@@ -209,7 +230,7 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
     pbr = {"baseColorTexture": {"index": color}, "metallicRoughnessTexture": {"index": surface}}
     material = builder.material(pbrMetallicRoughness=pbr, normalTexture={"index": normal})
     builder.mesh(builder.primitive(material=material, TEXCOORD_0=UV))
-    bare, wood = builder.write(tmp_path / "bare.glb"), obj(tmp_path, "map_Kd C:\\maps\\wood.png\nPr 0.25")
+    bare, wood = builder.write(tmp_path / "bare.glb"), obj_leaf(tmp_path, "map_Kd C:\\maps\\wood.png\nPr 0.25")
     asset = load_mesh(bare, transparent_parts="opaque")
     points = sample_surface(asset, 20, 0)
     for values, expected in ((points.base_color, 0.5), (points.roughness, 0.5), (points.metallic, 0)):
@@ -222,5 +243,5 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
     assert "names a file that is missing: 'look.mtl'" in asset.notes[0]
     assert "uses a material that no library defines: 'leaf', 'plain'" in asset.notes[1]
     for path, name in ((bare, "maps/color.png"), (wood, "look.mtl")):
-        with pytest.raises(RejectedAsset, match=f"missing: '{name}'"):
+        with pytest.raises(UserError, match=f"missing: '{name}'"):
             load_mesh(path)

@@ -10,9 +10,10 @@ from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
 from support.handmade import plain
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.formats.assets import Asset, Part, lookup, read_image, shrink, value_texels
+from data_gen.render.views import bitmap_texture
+from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
 from spnr_jax.formats.meshes import load_mesh
-from spnr_jax.formats.surface_points import normalise, sample_surface, tilt_normals
+from spnr_jax.formats.surface_points import normalise, sample_surface
 
 FACES = SQUARE.reshape(2, 3)
 
@@ -48,16 +49,10 @@ def test_points_are_uniform_by_area_on_the_faces_that_they_name():
 
 
 def test_the_material_is_looked_up_where_the_point_lies():
-    ramp = np.linspace(0, 1, 64, dtype=np.float32)  # value of texel centre i is i / 63
-    look = plain(
-        color=np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.ones((64, 64))], axis=-1),
-        roughness=np.tile(1 - ramp[:, None], (1, 2)),
-        metallic=0.25,
-    )
+    ramp = np.tile(np.linspace(0, 1, 64, dtype=np.float32), (64, 1))  # value of texel centre i is i / 63
+    look = plain(color=np.stack([ramp, ramp.T, np.ones((64, 64))], axis=-1), roughness=1 - ramp.T[:, :2], metallic=0.25)
     tint = np.tile([0.5, 1.0, 0.5], (4, 1))
-    part = square(
-        look=replace(look, wrap="clamp"), texcoords=np.stack([CORNERS[:, 0], 1 - CORNERS[:, 1]], axis=-1), colors=tint
-    )
+    part = square(look=replace(look, wrap="clamp"), texcoords=UV.astype(float), colors=tint)
     points = sample_surface(Asset(parts=(part,)), 1000, 3)
     u, v = points.positions[:, 0], 1 - points.positions[:, 1]
 
@@ -99,15 +94,15 @@ def bumpy_normals(tmp_path, normal, uv=UV, transform=None, **attributes):
     return sample_surface(asset, 10, 0).normals
 
 
-@pytest.mark.parametrize(
-    ("uv", "of_red", "of_green"),
-    [
-        (UV, X, Y),  # red tilts along u, green up the picture
-        (UV[:, ::-1], -Y, -X),  # transposed: a quarter turn and a mirror
-        (UV * [-1, 1], X * [-1, 1, 1], Y),  # mirrored in u alone
-        (1 - UV, X * [-1, 1, 1], Y * [1, -1, 1]),  # half a turn
-    ],
-)
+TURNS = [  # coordinates; what red, which tilts along u, and green, up the picture, become
+    (UV, X, Y),
+    (UV[:, ::-1], -Y, -X),  # transposed: a quarter turn and a mirror
+    (UV * [-1, 1], X * [-1, 1, 1], Y),  # mirrored in u alone
+    (1 - UV, X * [-1, 1, 1], Y * [1, -1, 1]),  # half a turn
+]
+
+
+@pytest.mark.parametrize(("uv", "of_red", "of_green"), TURNS)
 def test_a_normal_map_tilts_along_the_coordinates_however_they_are_turned(tmp_path, uv, of_red, of_green):
     for normal, (x, y, _) in ((RED, of_red), (GREEN, of_green)):
         np.testing.assert_allclose(bumpy_normals(tmp_path, normal, uv.astype("f4")), [[x, y, 0.8]] * 10, atol=0.01)
@@ -124,14 +119,6 @@ def test_vertex_normals_are_what_is_tilted(tmp_path):
     leaning = np.tile(np.float32([0, 0.6, 0.8]), (4, 1))
     found = bumpy_normals(tmp_path, RED, NORMAL=leaning)
     np.testing.assert_allclose(found, [0.8 * leaning[0] + [0.6, 0, 0]] * 10, atol=0.01)
-
-
-def test_where_the_coordinates_have_no_area_the_normal_stays():
-    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 3, float)
-    texcoords = np.array([[[0, 0], [0, 0], [0, 0]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, 0], [0, 1]]], float)
-    normals = np.tile([0.0, 0, 1], (3, 1))
-    found = tilt_normals(normals, np.array([RED, RED, (0, 0, 0)]), corners, texcoords)
-    np.testing.assert_array_equal(found, normals)
 
 
 # Texels
@@ -155,10 +142,7 @@ def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
     rng = np.random.default_rng(3)
     texels = rng.random(shape, dtype=np.float32)
     texcoords = rng.uniform(-2.5, 3.5, (200, 2)).astype(np.float32)
-    bitmap = mi.Bitmap(texels if len(shape) == 3 else texels[..., None])
-    texture = mi.load_dict(
-        {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": wrap}
-    )
+    texture = mi.load_dict(bitmap_texture(texels if len(shape) == 3 else texels[..., None], wrap))
     hit = mi.SurfaceInteraction3f()
     expected = []
     for u, v in texcoords.tolist():
@@ -168,9 +152,9 @@ def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
 
 
 def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
-    texels = np.random.default_rng(0).random((2048, 6, 3), dtype=np.float32)
-    expected = texels.reshape(1024, 2, 3, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(shrink(texels), expected, atol=1e-6)
+    texels = np.random.default_rng(0).integers(0, 256, (2048, 6, 3), dtype=np.uint8)
+    expected = (texels / 255).reshape(1024, 2, 3, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(decode_texels(texels), expected, atol=1e-6)
 
 
 def test_sixteen_bit_grey_images_are_scaled_not_clipped():
@@ -178,4 +162,4 @@ def test_sixteen_bit_grey_images_are_scaled_not_clipped():
     assert read_image(stream, "black").tolist() == [[[0, 0, 0, 255]]]
     stream = io.BytesIO()
     Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
-    assert value_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
+    assert decode_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]

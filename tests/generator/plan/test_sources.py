@@ -9,8 +9,8 @@ from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
 
 from data_gen.plan import sources
 from data_gen.store import layout
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.assets import RejectedAsset
 from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.meshes import load_mesh
 
@@ -33,6 +33,27 @@ def test_another_folder_is_refused_with_what_was_expected_and_found(options, exp
         assert expected in message
         assert found in message
         assert message.count("\n") == 1
+
+
+def ids(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return {identifier: str(path.relative_to(folder)) for identifier, path in sources.find_meshes(folder)}
+
+
+def test_ids_are_stems_or_the_folder_of_a_lone_obj_or_gltf(tmp_path):
+    found = ids(tmp_path, "b.glb", "a.PLY", "pan/model.obj", "pan/model.mtl", "lamp/scene.gltf", "x/cup.glb")
+    expected = {"a": "a.PLY", "b": "b.glb", "cup": "x/cup.glb", "lamp": "lamp/scene.gltf", "pan": "pan/model.obj"}
+    assert list(found.items()) == list(expected.items())
+
+
+def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(tmp_path):
+    found = ids(tmp_path, "a b.glb", "a_b.glb", "a?b.glb", "A_B.GLB", "ä.off", "ö.off", "a_b.glb.ply")
+    assert len(found) == 7
+    assert len({name.casefold() for name in found}) == 7
+    assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABGLP._-0123456789") for name in found)
+    assert all(name[0] not in "._-" for name in found)
 
 
 # Amazon Berkeley Objects
@@ -173,7 +194,7 @@ def test_both_layouts_give_the_same_object_with_its_texture_and_without_doubled_
 
 def test_the_folder_is_wider_for_objects_of_shapenet_only_and_neither_names_nor_links_lead_outside(tmp_path):
     folder = add(tmp_path, "car", "abc", 2)
-    with pytest.raises(RejectedAsset, match="outside its own folder"):
+    with pytest.raises(UserError, match="outside its own folder"):
         load_mesh(folder / "models" / "model_normalized.obj")
     elsewhere = tmp_path / "elsewhere" / "models"
     elsewhere.parent.mkdir()
@@ -185,5 +206,5 @@ def test_the_folder_is_wider_for_objects_of_shapenet_only_and_neither_names_nor_
     np.testing.assert_allclose(colours[0], srgb_to_linear(TEXELS / 255), atol=1e-6)
     for name in ("../../other/images/x.jpg", "../../../x.jpg", "/etc/x.jpg", "..", "../images/../../x"):
         elsewhere.joinpath("model_normalized.mtl").write_text(MTL.format(image=name))
-        with pytest.raises(RejectedAsset, match="outside its own folder"):
+        with pytest.raises(UserError, match="outside its own folder"):
             load(folder)

@@ -5,8 +5,9 @@ import pytest
 from support.handmade import BLUE, GREEN, GREY, RED, ball, box, checked_box_and_ball, plain
 
 from data_gen.render import views
+from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, surface_points
-from spnr_jax.formats.assets import Asset, RejectedAsset
+from spnr_jax.formats.assets import Asset
 
 WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=32, spp=16, views=2)
@@ -91,7 +92,7 @@ def test_condition_pixels_carry_the_reference_colour_and_hidden_points_leave_non
 def test_vertex_colours_on_a_texture_are_rejected_with_the_reason():
     part = checked_box_and_ball().parts[0]
     both = type(part)(**{**vars(part), "colors": np.ones_like(part.positions)})
-    with pytest.raises(RejectedAsset, match="vertex colours"):
+    with pytest.raises(UserError, match="vertex colours"):
         views.build_scene(Asset(parts=(both,)), WHITE_LIGHT)
 
 
