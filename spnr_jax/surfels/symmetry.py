@@ -7,7 +7,7 @@ candidates  planes through the centroid, near which every plane of symmetry pass
             nearest to the cloud are refined
 refinement  the reflected points are registered to the cloud (point-to-plane ICP, Chen and Medioni 1992)
 acceptance  around most points, the reflected ones lie as far from the nearest measured one as other points of the
-            surface would; only those points are reflected, so that what is on one side alone is not copied
+            surface would; a reflected point far from all measured ones, as on a part of one side alone, is left out
 
 NumPy on the host, for a cloud in the box: choices, without a gradient.  Lengths are in spacings unless stated.
 """
@@ -164,14 +164,13 @@ def find_fitting(surface: Surface, distance: Float[np.ndarray, " n"]) -> Bool[np
 
 
 def add_reflected(cloud: PointCloud, normal: Float[np.ndarray, "3"], offset: float) -> PointCloud:
-    """The cloud, then its points reflected in a plane, where they fit and do not lie next to a measured point."""
+    """The cloud, then its points reflected in a plane, where they lie between measured points of their color."""
     surface = measure_surface(cloud)
     found = reflect(surface, normal, offset)
-    fits = find_fitting(surface, found.distance)
-    roots = np.sqrt(np.asarray(cloud.base_color))
+    roots = np.sqrt(np.maximum(cloud.base_color, 0))
     alike = np.linalg.norm(roots[found.match] - roots, axis=1) < UNLIKE
-    kept = np.flatnonzero(fits & alike & (found.distance > NEAREST) & (found.distance < FARTHEST))
-    added = {"positions": found.position[kept], "normals": found.normals[kept]}
+    kept = np.flatnonzero(alike & (found.distance > NEAREST) & (found.distance < FARTHEST))
+    added = {"positions": np.clip(found.position[kept], -1, 1), "normals": found.normals[kept]}
 
     def extend(name: str, values: np.ndarray) -> np.ndarray:
         more = added[name] if name in added else values[kept]
