@@ -16,7 +16,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.records import PointCloud
@@ -24,15 +24,16 @@ from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral
 
 FEWEST_POINTS, MOST_POINTS = 128, 2048  # of a cloud that is completed
+EVEN = 0.7  # mean distance to the nearest other point from which points are even (0.8; random ones 0.55)
 MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
 CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
 SCORING = 256  # points that score a candidate
 ROUNDS, ROBUST = 13, (0.5, 0.05)  # of the registration; first and last height at which a point has half its weight
 MATCHES = 4  # nearest points among which a reflected point is matched
 FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
-RANDOM, COVERED, BOUNDS = 0.54, 0.65, (0.36, 0.55)  # of `expect_distance`; measured on chairs and balls
 AROUND = 12  # neighbors over which distances are averaged
-FITS, LEAST_SHARE = 1.4, 0.8  # times the expected distance up to which points fit; share of them in a symmetric cloud
+FITS = 0.52  # mean distance over a neighborhood up to which its points fit; other points of an even surface have 0.37
+LEAST_SHARE = 0.8  # of the points that fit
 NEAREST, FARTHEST = 0.3, 0.8  # distances from measured points between which a reflected point is kept
 UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected point does not fit its match
 
@@ -64,25 +65,29 @@ class Reflection(NamedTuple):
 class Plane(NamedTuple):
     """The points x with normal . x = offset; `distance` is the mean from reflected points to the nearest measured one.
 
-    `fits` says which points have reflected ones around them as near as expected.
+    `share` of the points have reflected ones around them that lie as near as other points of the surface would.
     """
 
     normal: Float[np.ndarray, "3"]
     offset: float
     distance: float
-    fits: Bool[np.ndarray, " n"]
+    share: float
 
 
 def complete(cloud: PointCloud) -> PointCloud:
     """The cloud (unbatched, without padding), then its points reflected in up to two planes of symmetry.
 
-    The same cloud if it has too few or too many points, or no symmetry.  Reflected points keep their material; where
-    the surface has another color there are none, because a pattern need not be symmetric.
+    The same cloud if it has too few or too many points, random ones (their gaps would become holes among more points),
+    or no symmetry.  Reflected points keep their material; where the surface has another color there are none, because
+    a pattern need not be symmetric.
     """
     if not FEWEST_POINTS <= len(cloud.mask) <= MOST_POINTS:
         return cloud
+    surface = measure_surface(cloud)
+    if surface.tree.query(surface.position, [2])[0].mean() < EVEN * surface.spacing:
+        return cloud
     chosen: list[Plane] = []
-    for plane in find_planes(measure_surface(cloud)):
+    for plane in find_planes(surface):
         if len(chosen) < MOST_PLANES and all(abs(plane.normal @ other.normal) < ORTHOGONAL for other in chosen):
             chosen.append(plane)
     for plane in chosen:
@@ -114,7 +119,7 @@ def find_planes(surface: Surface) -> list[Plane]:
         if len(refined) < REFINED and all(abs(normal @ other) < DISTINCT for other in refined):
             refined.append(normal)
     planes = [register(surface, normal, float(centroid @ normal)) for normal in refined]
-    return sorted((x for x in planes if x.fits.mean() > LEAST_SHARE), key=lambda x: x.distance)
+    return sorted((x for x in planes if x.share > LEAST_SHARE), key=lambda x: x.distance)
 
 
 def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
@@ -133,7 +138,8 @@ def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) ->
         length = np.linalg.norm(turned)
         normal, offset = turned / length, float((offset + step[2]) / length)
     distance = reflect(surface, normal, offset).distance
-    return Plane(normal, offset, float(distance.mean()), find_fitting(surface, distance))
+    fits = distance[surface.around].mean(axis=1) < FITS
+    return Plane(normal, offset, float(distance.mean()), float(fits.mean()))
 
 
 def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Reflection:
@@ -147,20 +153,6 @@ def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> 
     rows, best = np.arange(len(near)), np.argmin(np.abs(height) + 0.3 * distance + 1 - cosine, axis=1)
     match = near[rows, best], height[rows, best], cosine[rows, best]
     return Reflection(reflected, normals, *match, np.minimum(distance[:, 0], FAR))
-
-
-def expect_distance(surface: Surface) -> float:
-    """Mean distance from other points of the surface to the nearest point, from the mean distance between points.
-
-    Among random points both are alike; even points lie farther apart and leave smaller gaps.
-    """
-    own = surface.tree.query(surface.position, [2])[0].mean() / surface.spacing
-    return float(np.clip(RANDOM - COVERED * (own - RANDOM), *BOUNDS))
-
-
-def find_fitting(surface: Surface, distance: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Where the reflected points of a neighborhood lie at these distances as other points of the surface would."""
-    return distance[surface.around].mean(axis=1) < FITS * expect_distance(surface)
 
 
 def add_reflected(cloud: PointCloud, normal: Float[np.ndarray, "3"], offset: float) -> PointCloud:
