@@ -75,9 +75,11 @@ def kind_of(path: Path) -> str:
 
     The error names the format, its version and how to convert it.
     """
-    suffix, known = path.suffix.lower(), f"expected one of {' '.join(KNOWN)}"
+    suffix, known = path.suffix.lower(), f"one of {' '.join(KNOWN)}"
+    if path.is_dir():
+        raise UserError(f"{path}: a folder; expected a file of {known}")
     if path.exists() and not path.is_file():
-        raise UserError(f"{path}: {'a folder' if path.is_dir() else 'a pipe or a device'}; {known}")
+        raise UserError(f"{path}: a pipe or a device; save what comes from it as a file")
     if not path.is_file() and (suffix in KNOWN or suffix in FOREIGN):
         raise UserError(f"{path}: there is no such file")
     head = b""
@@ -96,7 +98,7 @@ def kind_of(path: Path) -> str:
             raise UserError(f"{path}: {name}{of_version}, which is not read: {convert}")
     kind = _told_kind(TEXTS, head, suffix) or suffix
     if kind not in KNOWN:
-        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; {known}")
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected {known}")
     return kind
 
 
