@@ -44,9 +44,8 @@ LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
 EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
-GRAPH = dataclasses.replace(
-    CONSTANTS, even_distance=0.515
-)  # even points with reflected ones (surfels/symmetry.py) have 0.53
+# of the estimate that the network sees: even points with reflected ones (surfels/symmetry.py) have 0.53
+GRAPH = dataclasses.replace(CONSTANTS, even_distance=0.515)
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
 LEAST_PROBABILITY = 0.55  # probability above which a learned point is kept
 
