@@ -111,11 +111,14 @@ class Asset:
 def make_material(base_color: Any = 0.5, roughness: Any = 0.5, metallic: Any = 0.0, wrap: Wrap = "repeat") -> Material:
     """A material of channels, one value or an array each, clipped to [0, 1]; grey of roughness 0.5 by default."""
     color = np.broadcast_to(base_color, (*np.shape(base_color)[:-1], 3))
-    channels = [np.asarray(values, np.float32) for values in (color, roughness, metallic)]
-    if not all(np.isfinite(values).all() for values in channels):
-        raise UserError("has a material with values that are not finite (NaN or infinity)")
-    color, roughness, metallic = (np.clip(values, 0, 1) for values in channels)
-    return Material(base_color=color, roughness=roughness, metallic=metallic, wrap=wrap)
+    channels: dict[str, Any] = {"base_color": color, "roughness": roughness, "metallic": metallic}
+    for name, values in channels.items():
+        channels[name] = values = np.asarray(values, np.float32)
+        if values.ndim - CHANNELS[name] not in (0, 2) or 0 in values.shape:
+            raise UserError(f"has a material with {name} of shape {values.shape}: broken file")
+        if not np.isfinite(values).all():
+            raise UserError(f"has a material whose {name} is not finite (NaN or infinity)")
+    return Material(**{name: np.clip(values, 0, 1) for name, values in channels.items()}, wrap=wrap)
 
 
 class Loading:

@@ -39,11 +39,15 @@ UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected 
 
 
 class Surface(NamedTuple):
-    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points."""
+    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points.
+
+    `evenness` is the mean distance to the nearest other point.
+    """
 
     position: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
     spacing: float
+    evenness: float
     around: Int[np.ndarray, "n 12"]
     tree: cKDTree
 
@@ -84,7 +88,7 @@ def complete(cloud: PointCloud) -> PointCloud:
     if not FEWEST_POINTS <= len(cloud.mask) <= MOST_POINTS:
         return cloud
     surface = measure_surface(cloud)
-    if surface.tree.query(surface.position, [2])[0].mean() < EVEN * surface.spacing:
+    if surface.evenness < EVEN:
         return cloud
     chosen: list[Plane] = []
     for plane in find_planes(surface):
@@ -102,7 +106,7 @@ def measure_surface(cloud: PointCloud) -> Surface:
     distance, around = tree.query(position, list(range(1, AROUND + 1)))
     spacing = max(float(np.median(distance[:, 1:7].mean(axis=1))), np.finfo(np.float64).tiny)
     normal = estimate_normals(position, position) if cloud.normals is None else np.asarray(cloud.normals, np.float64)
-    return Surface(position, normal, spacing, around, tree)
+    return Surface(position, normal, spacing, float(distance[:, 1].mean()) / spacing, around, tree)
 
 
 def find_planes(surface: Surface) -> list[Plane]:

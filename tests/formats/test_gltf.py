@@ -100,6 +100,7 @@ REFUSED = (
     (glass("textures/gone.png"), "missing: 'textures/gone.png'"),
     *((glass(uri), "outside its own folder") for uri in OUTSIDE),
     (glass("broken.png"), "broken.png"),
+    (glass(pbrMetallicRoughness={"roughnessFactor": [0.1, 0.2, 0.3]}), "roughness of shape (3,)"),
     (glass("a.ktx2"), "cannot be read: a.ktx2 (KTX2, which is not read: convert it to PNG"),
     (square(change=repeat, indices=np.zeros(3 * 30_000, np.uint16)), "repeats its meshes more than can be read"),
     (GltfBuilder(), "has no faces"),
