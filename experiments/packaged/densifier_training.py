@@ -32,7 +32,7 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.densifier import CANDIDATES, Candidates, Nodes, build_graph, init, predict, rotate, weigh_rows
-from spnr_jax.surfels import geometry, sides
+from spnr_jax.surfels import geometry, sides, symmetry
 from spnr_jax.surfels.geometry import PointColumns, order_in_space
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
@@ -144,12 +144,13 @@ _see = jax.jit(build_graph, compiler_options=QUICKEST)
 def make_cloud(
     places: np.ndarray, chosen: np.ndarray, truth: Any, true_position: np.ndarray, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """What the network sees of a cloud, and the true points that its children are compared with."""
-    order, near = order_in_space(places)
+    """What the network sees of a cloud, with reflected points, and the true points near each candidate."""
+    columns = {name: getattr(truth, name)[chosen] for name in ("base_color", "roughness", "metallic")}
+    cloud = symmetry.complete(PointCloud(positions=places, mask=np.ones(len(places), bool), **columns))
+    order, near = order_in_space(np.asarray(cloud.positions))
     count = len(order)
     size = cloud_arrays.bucket(count)
-    columns = {name: getattr(truth, name)[chosen][order] for name in ("base_color", "roughness", "metallic")}
-    cloud = PointCloud(positions=places[order], mask=np.ones(count, bool), **columns)
+    cloud = jax.tree.map(lambda x: x[order], cloud)
     neighbors = np.pad(near, [(0, size - count), (0, 0)], constant_values=-1)
     nodes, found = jax.device_get(_see(cloud_arrays.pad(cloud, size), neighbors))
     kept = np.flatnonzero(found.exists[: CANDIDATES * count])
@@ -160,7 +161,7 @@ def make_cloud(
     arrays |= {"neighbors": near, "asked": asked.astype(np.int32), "floor": np.array(0.7 * np.sqrt(count / len(dense)))}
     arrays["matched"] = cKDTree(dense).query(found.middle[kept], MATCHED)[1].astype(np.int32)
     arrays["nearest"] = cKDTree(found.middle[kept]).query(dense[asked], NEAREST)[1].astype(np.int32)
-    arrays["parents"] = cKDTree(places[order]).query(dense[asked], 2)[1].astype(np.int32)
+    arrays["parents"] = cKDTree(cloud.positions).query(dense[asked], 2)[1].astype(np.int32)
     return {
         name: values.astype(np.float32) if values.dtype == np.float64 else values for name, values in arrays.items()
     }

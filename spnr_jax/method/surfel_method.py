@@ -57,26 +57,30 @@ def encode(
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
 
 
-def encode_in_box(cloud: PointCloud) -> SurfelScene:
+def encode_in_box(cloud: PointCloud, least: int = 0) -> SurfelScene:
     """Scene of a cloud in the box (unbatched), with centre 0 and scale 1; on the host, compiled once per padded size.
 
-    The surfels are those of the unmasked points, sorted so that close points are close in memory, and padded.
+    The surfels are those of the unmasked points, sorted so that close points are close in memory, and padded, to
+    `least` or more.
     """
     real = cloud_arrays.strip(cloud)
     real = jax.tree.map(np.float32, real).replace(mask=real.mask)
     order, near = order_in_space(real.positions)
-    size = cloud_arrays.bucket(len(order))
+    size = max(cloud_arrays.bucket(len(order)), least)
     neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
 
 
-def densify_sparse(variables: dict | None, cloud: PointCloud) -> PointCloud:
-    """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier."""
+def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = 0) -> PointCloud:
+    """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier.
+
+    Compiled once per padded size, which is `least` or more.
+    """
     count = int(np.sum(cloud.mask))
     if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     real = symmetry.complete(cloud_arrays.strip(cloud))
-    padded = cloud_arrays.pad(real, cloud_arrays.bucket(len(real.mask)))
+    padded = cloud_arrays.pad(real, max(cloud_arrays.bucket(len(real.mask)), least))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 

@@ -27,7 +27,7 @@ FEWEST_POINTS, MOST_POINTS = 128, 2048  # of a cloud that is completed
 EVEN = 0.7  # mean distance to the nearest other point from which points are even (0.8; random ones 0.55)
 MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
 CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
-SCORING = 256  # points that score a candidate
+SCORING, REGISTERING = 256, 512  # points that score a candidate, and that register a plane
 ROUNDS, ROBUST = 13, (0.5, 0.05)  # of the registration; first and last height at which a point has half its weight
 MATCHES = 4  # nearest points among which a reflected point is matched
 FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
@@ -94,8 +94,8 @@ def complete(cloud: PointCloud) -> PointCloud:
     for plane in find_planes(surface):
         if len(chosen) < MOST_PLANES and all(abs(plane.normal @ other.normal) < ORTHOGONAL for other in chosen):
             chosen.append(plane)
-    for plane in chosen:
-        cloud = add_reflected(cloud, plane.normal, plane.offset)
+    for number, plane in enumerate(chosen):
+        cloud = add_reflected(cloud, measure_surface(cloud) if number else surface, plane)
     return cloud
 
 
@@ -128,13 +128,15 @@ def find_planes(surface: Surface) -> list[Plane]:
 
 def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
     """The plane after point-to-plane registration of the reflected points to the cloud, robustly weighted."""
+    chosen = slice(None, None, -(-len(surface.position) // REGISTERING))
+    position = surface.position[chosen]
     for robust in np.geomspace(*ROBUST, ROUNDS):
-        found = reflect(surface, normal, offset)
+        found = reflect(surface, normal, offset, chosen)
         weight = (found.distance < FAR) * (found.cosine > LEAST_COSINE) / (1 + (found.height / robust) ** 2)
         tangents = np.linalg.svd(normal[None])[2][1:]
         target = surface.normal[found.match]
-        before, facing = surface.position @ normal - offset, target @ normal
-        turns = [(surface.position @ x) * facing + before * (target @ x) for x in tangents]
+        before, facing = position @ normal - offset, target @ normal
+        turns = [(position @ x) * facing + before * (target @ x) for x in tangents]
         slopes = 2 * np.stack([*turns, -facing], axis=1)
         weighted = slopes * weight[:, None]
         step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (found.height * surface.spacing), rcond=1e-6)[0]
@@ -146,10 +148,11 @@ def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) ->
     return Plane(normal, offset, float(distance.mean()), float(fits.mean()))
 
 
-def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Reflection:
-    """The points reflected in a plane, each matched to one of the nearest points by place and normal."""
-    reflected = surface.position - 2 * (surface.position @ normal - offset)[:, None] * normal
-    normals = surface.normal - 2 * (surface.normal @ normal)[:, None] * normal
+def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float, chosen: slice = slice(None)) -> Reflection:
+    """The points, or chosen ones, reflected in a plane, each matched to one of the nearest by place and normal."""
+    position, normals = surface.position[chosen], surface.normal[chosen]
+    reflected = position - 2 * (position @ normal - offset)[:, None] * normal
+    normals = normals - 2 * (normals @ normal)[:, None] * normal
     distance, near = surface.tree.query(reflected, MATCHES)
     distance, facing = distance / surface.spacing, surface.normal[near]
     cosine = np.abs(np.einsum("ni,nki->nk", normals, facing))
@@ -159,10 +162,9 @@ def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> 
     return Reflection(reflected, normals, *match, np.minimum(distance[:, 0], FAR))
 
 
-def add_reflected(cloud: PointCloud, normal: Float[np.ndarray, "3"], offset: float) -> PointCloud:
+def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointCloud:
     """The cloud, then its points reflected in a plane, where they lie between measured points of their color."""
-    surface = measure_surface(cloud)
-    found = reflect(surface, normal, offset)
+    found = reflect(surface, plane.normal, plane.offset)
     roots = np.sqrt(np.maximum(cloud.base_color, 0))
     alike = np.linalg.norm(roots[found.match] - roots, axis=1) < UNLIKE
     kept = np.flatnonzero(alike & (found.distance > NEAREST) & (found.distance < FARTHEST))

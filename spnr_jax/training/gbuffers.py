@@ -51,6 +51,7 @@ WITHOUT_NORMALS = 0.5  # share of the other clouds without given normals
 OWN_NORMALS = 0.5  # share of these whose normals are estimated from the kept points only, as in a small file
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # a view averages side x side pixels of its reference; drawn from these
 SMALL, FEWER = 4, 8  # from this side on, a cloud has at most 1 / FEWER of the points
+LEAST_PADDED = 2048  # of a padded cloud, half that of its surfels: with few sizes, little is compiled
 MOST_ENTRIES = 2**22  # of a view: one with more is dropped
 LEAST_PIXELS = 8  # least pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel belongs to it
@@ -161,7 +162,7 @@ def make_views(item: ObjectData, number: int, light: Light, config: TrainConfig,
     generator = np.random.default_rng((config.seed, CLOUD_STREAM, zlib.crc32(item.name.encode()), number))
     side = int(generator.choice(SIDES))
     cloud = random_cloud(item.cloud, side, config, generator)
-    scene = encode_in_box(surfel_method.densify_sparse(variables, cloud))
+    scene = encode_in_box(surfel_method.densify_sparse(variables, cloud, LEAST_PADDED), 2 * LEAST_PADDED)
     arrays: Arrays = {}
     doublings: list[int] = []
     for index in generator.permutation(len(item.images))[: config.views_per_object]:
