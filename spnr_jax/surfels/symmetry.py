@@ -32,22 +32,33 @@ ROUNDS, ROBUST = 13, (0.5, 0.05)  # of the registration; first and last height a
 MATCHES = 4  # nearest points among which a reflected point is matched
 FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
 AROUND = 12  # neighbors over which distances are averaged
-FITS = 0.52  # mean distance over a neighborhood up to which its points fit; other points of an even surface have 0.37
 LEAST_SHARE = 0.8  # of the points that fit
-NEAREST, FARTHEST = 0.3, 0.8  # distances from measured points between which a reflected point is kept
 UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected point does not fit its match
 
 
-class Surface(NamedTuple):
-    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points.
+class Limits(NamedTuple):
+    """Limits of the distance from a reflected point to the nearest measured one.
 
-    `evenness` is the mean distance to the nearest other point.
+    Up to a mean of `fits` over a neighborhood its points fit.  A reflected point is kept between `nearest`, which is
+    also the least distance between two of them, and `farthest`.
     """
+
+    fits: float
+    nearest: float
+    farthest: float
+
+
+EVENLY_SPREAD = Limits(fits=0.52, nearest=0.3, farthest=0.8)  # other points of such a surface have a mean of 0.37
+RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6)  # and of such a one 0.5; what is added lies in wide gaps
+
+
+class Surface(NamedTuple):
+    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points."""
 
     position: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
     spacing: float
-    evenness: float
+    limits: Limits
     around: Int[np.ndarray, "n 12"]
     tree: cKDTree
 
@@ -81,21 +92,18 @@ class Plane(NamedTuple):
 def complete(cloud: PointCloud) -> PointCloud:
     """The cloud (unbatched, without padding), then its points reflected in up to two planes of symmetry.
 
-    The same cloud if it has too few or too many points, random ones (their gaps would become holes among more points),
-    or no symmetry.  Reflected points keep their material; where the surface has another color there are none, because
-    a pattern need not be symmetric.
+    The same cloud if it has too few or too many points, or no symmetry.  Reflected points keep their material; where
+    the surface has another color there are none, because a pattern need not be symmetric.
     """
     if not FEWEST_POINTS <= len(cloud.mask) <= MOST_POINTS:
         return cloud
     surface = measure_surface(cloud)
-    if surface.evenness < EVEN:
-        return cloud
     chosen: list[Plane] = []
     for plane in find_planes(surface):
         if len(chosen) < MOST_PLANES and all(abs(plane.normal @ other.normal) < ORTHOGONAL for other in chosen):
             chosen.append(plane)
     for number, plane in enumerate(chosen):
-        cloud = add_reflected(cloud, measure_surface(cloud) if number else surface, plane)
+        cloud = add_reflected(cloud, measure_surface(cloud) if number else surface, plane, surface.limits)
     return cloud
 
 
@@ -106,7 +114,8 @@ def measure_surface(cloud: PointCloud) -> Surface:
     distance, around = tree.query(position, list(range(1, AROUND + 1)))
     spacing = max(float(np.median(distance[:, 1:7].mean(axis=1))), np.finfo(np.float64).tiny)
     normal = estimate_normals(position, position) if cloud.normals is None else np.asarray(cloud.normals, np.float64)
-    return Surface(position, normal, spacing, float(distance[:, 1].mean()) / spacing, around, tree)
+    limits = RANDOM if distance[:, 1].mean() < EVEN * spacing else EVENLY_SPREAD
+    return Surface(position, normal, spacing, limits, around, tree)
 
 
 def find_planes(surface: Surface) -> list[Plane]:
@@ -144,7 +153,7 @@ def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) ->
         length = np.linalg.norm(turned)
         normal, offset = turned / length, float((offset + step[2]) / length)
     distance = reflect(surface, normal, offset).distance
-    fits = distance[surface.around].mean(axis=1) < FITS
+    fits = distance[surface.around].mean(axis=1) < surface.limits.fits
     return Plane(normal, offset, float(distance.mean()), float(fits.mean()))
 
 
@@ -162,12 +171,13 @@ def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float, cho
     return Reflection(reflected, normals, *match, np.minimum(distance[:, 0], FAR))
 
 
-def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointCloud:
+def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane, limits: Limits) -> PointCloud:
     """The cloud, then its points reflected in a plane, where they lie between measured points of their color."""
     found = reflect(surface, plane.normal, plane.offset)
     roots = np.sqrt(np.maximum(cloud.base_color, 0))
     alike = np.linalg.norm(roots[found.match] - roots, axis=1) < UNLIKE
-    kept = np.flatnonzero(alike & (found.distance > NEAREST) & (found.distance < FARTHEST))
+    fits = np.flatnonzero(alike & (found.distance > limits.nearest) & (found.distance < limits.farthest))
+    kept = fits[space_out(found.position[fits], found.distance[fits], limits.nearest * surface.spacing)]
     added = {"positions": np.clip(found.position[kept], -1, 1), "normals": found.normals[kept]}
 
     def extend(name: str, values: np.ndarray) -> np.ndarray:
@@ -176,3 +186,17 @@ def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointClo
 
     columns = {name: extend(name, np.asarray(x)) for name, x in vars(cloud).items() if x is not None}
     return dataclasses.replace(cloud, **columns)
+
+
+def space_out(
+    position: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, " n"], least: float
+) -> Int[np.ndarray, " kept"]:
+    """Indices of points, those of the largest distance first, without those closer than `least` to one before."""
+    if not len(position):
+        return np.zeros(0, np.int64)
+    near, free = cKDTree(position).query_ball_point(position, least), np.ones(len(position), bool)
+    kept = np.zeros(len(position), bool)
+    for point in np.argsort(-distance, kind="stable"):
+        if free[point]:
+            kept[point], free[near[point]] = True, False
+    return np.flatnonzero(kept)

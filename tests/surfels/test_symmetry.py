@@ -127,20 +127,38 @@ def test_two_planes_bring_points_of_all_quarters():
     assert np.quantile(distance, 0.98) < 0.1
 
 
-def test_a_cloud_without_symmetry_stays_as_it_is():
+@pytest.mark.parametrize("spread", ["even", "random"])
+def test_a_cloud_without_symmetry_stays_as_it_is(spread):
     rng = np.random.default_rng(0)
     parts = [
         box(rng.uniform(-0.5, 0.5, 3), rng.uniform(0.05, 0.3, 3), 8000, rng)[0]
         @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
         for _ in range(5)
     ]
-    one, _ = sparse(np.concatenate(parts))
+    one, _ = sparse(rng.permutation(np.concatenate(parts)), spread=spread)
     assert symmetry.complete(one) is one
 
 
-def test_random_points_stay_as_they_are():
-    one, _ = sparse(np.random.default_rng(1).permutation(chair()[0]), 1000, "random")
-    assert symmetry.complete(one) is one
+def test_reflected_points_fill_the_gaps_of_random_ones():
+    points = np.random.default_rng(1).permutation(chair()[0])
+    one, _ = sparse(points, 1000, "random")
+    both, spacing = symmetry.complete(one), spacing_of(one)
+    assert len(both.mask) > 1200
+    assert np.quantile(cKDTree(points).query(both.positions[1000:])[0], 0.95) < 0.35 * spacing
+    apart = cKDTree(both.positions).query(both.positions[1000:], 2)[0][:, 1]
+    assert apart.min() > 0.44 * spacing
+    before, after = (np.quantile(cKDTree(x.positions).query(points)[0], 0.98) for x in (one, both))
+    assert after < 0.8 * before
+
+
+def test_spaced_points_leave_no_room_for_others():
+    rng = np.random.default_rng(0)
+    position, distance = rng.uniform(-1, 1, (500, 3)), rng.uniform(size=500)
+    kept = symmetry.space_out(position, distance, 0.3)
+    assert np.argmax(distance) in kept
+    assert cKDTree(position[kept]).query(position[kept], 2)[0][:, 1].min() >= 0.3
+    assert cKDTree(position[kept]).query(position)[0].max() <= 0.3
+    assert len(symmetry.space_out(position[:0], distance[:0], 0.3)) == 0
 
 
 @pytest.mark.parametrize("count", [symmetry.FEWEST_POINTS - 1, symmetry.MOST_POINTS + 1])
