@@ -33,6 +33,7 @@ MATCHES = 4  # nearest points among which a reflected point is matched
 FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
 AROUND = 12  # neighbors over which distances are averaged
 LEAST_SHARE = 0.8  # of the points that fit
+PLATE = 1.5  # distance from a plane within which nine tenths of the points lie if it is the middle of a plate
 UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected point does not fit its match
 
 
@@ -132,7 +133,15 @@ def find_planes(surface: Surface) -> list[Plane]:
         if len(refined) < REFINED and all(abs(normal @ other) < DISTINCT for other in refined):
             refined.append(normal)
     planes = [register(surface, normal, float(centroid @ normal)) for normal in refined]
-    return sorted((x for x in planes if x.share > LEAST_SHARE), key=lambda x: x.distance)
+    return sorted(
+        (x for x in planes if x.share > LEAST_SHARE and not halves_plate(surface, x)), key=lambda x: x.distance
+    )
+
+
+def halves_plate(surface: Surface, plane: Plane) -> bool:
+    """Whether the points lie so near to the plane that any surface would fit its mirror image."""
+    distance = np.abs(surface.position @ plane.normal - plane.offset)
+    return bool(np.quantile(distance, 0.9) < PLATE * surface.spacing)
 
 
 def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
