@@ -55,7 +55,7 @@ def _tiny(monkeypatch):
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
     monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": contenders.Method(draw=draw_grey)})
     monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)
-    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
+    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud, *_: cloud)  # it takes long to trace
     monkeypatch.setattr(evaluation, "choose_radius", lambda *_: 1.5)
 
 

@@ -31,10 +31,13 @@ def render(variables, scene, view, quality="best"):
     return next(surfel_method.render(variables or {}, volume, [view], [LIGHT], config=CONFIG, quality=quality))
 
 
+def ball():
+    return cloud(shape("sphere", 400)[0], base_color=np.full((400, 3), [0.7, 0.3, 0.1]))
+
+
 @pytest.fixture(scope="module")
 def scene():
-    positions, _, _ = shape("sphere", 400)
-    return encode_in_box(cloud(positions, base_color=np.full((400, 3), [0.7, 0.3, 0.1])))
+    return encode_in_box(ball())
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +49,13 @@ def fresh():
 def wobbled(fresh):
     leaves, form = jax.tree.flatten(fresh)
     return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
+
+
+def test_more_padding_changes_no_surfel(scene):
+    wider = encode_in_box(ball(), 1024)
+    assert wider.surfels.mask.shape == (1024,)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x[:512], y, atol=1e-5), wider.surfels, scene.surfels)
+    assert not wider.surfels.mask[400:].any()
 
 
 def truth(view):

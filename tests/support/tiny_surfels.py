@@ -55,7 +55,7 @@ def views() -> list[gbuffers.View]:
 def run() -> Path:
     """A finished run of CONFIG, whose clouds are learnt from as they are: densifier and preview take long to trace."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)
+        patch.setattr(surfel_method, "densify_sparse", lambda variables, cloud, *_: cloud)
         patch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 20.0}, PICTURE))
         trainer.train(CONFIG, dataset(), tiny_dataset.folder() / "shaded", SCHEDULE, light=LIGHT)
     return tiny_dataset.folder() / "shaded"

@@ -31,7 +31,7 @@ def small_pictures(monkeypatch):
     """Quick ones, and nothing is written to the home folder."""
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(surfaces, "RESOLUTION", tiny_surfels.SIZE)
-    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud: cloud)  # it takes long to trace
+    monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud, *_: cloud)  # it takes long to trace
 
 
 def made_by(*arguments):

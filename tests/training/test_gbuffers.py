@@ -242,7 +242,7 @@ def test_the_loss_is_the_sum_of_its_weighted_errors(crops, params):
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(monkeypatch, tmp_path):
     densified = []
     monkeypatch.setattr(
-        surfel_method, "densify_sparse", lambda variables, cloud: densified.append(variables.keys()) or cloud
+        surfel_method, "densify_sparse", lambda variables, cloud, *_: densified.append(variables.keys()) or cloud
     )
     monkeypatch.setattr(trainer, "preview", lambda *_: ({"val_psnr": 20.0}, PICTURE))
     with monkeypatch.context() as patch:
