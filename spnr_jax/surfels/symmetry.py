@@ -27,13 +27,12 @@ FEWEST_POINTS, MOST_POINTS = 128, 2048  # of a cloud that is completed
 EVEN = 0.7  # mean distance to the nearest other point from which points are even (0.8; random ones 0.55)
 MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
 CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
-SCORING, REGISTERING = 256, 512  # points that score a candidate, and that register a plane
+SCORING, REGISTERING = 256, 1024  # points that score a candidate, and that register a plane
 ROUNDS, ROBUST = 13, (0.5, 0.05)  # of the registration; first and last height at which a point has half its weight
 MATCHES = 4  # nearest points among which a reflected point is matched
 FAR, LEAST_COSINE = 2.0, 0.7  # limits of a match: distance to the nearest point, cosine of normals
 AROUND = 12  # neighbors over which distances are averaged
 LEAST_SHARE = 0.8  # of the points that fit
-PLATE = 1.5  # distance from a plane within which nine tenths of the points lie if it is the middle of a plate
 UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected point does not fit its match
 
 
@@ -41,16 +40,19 @@ class Limits(NamedTuple):
     """Limits of the distance from a reflected point to the nearest measured one.
 
     Up to a mean of `fits` over a neighborhood its points fit.  A reflected point is kept between `nearest`, which is
-    also the least distance between two of them, and `farthest`.
+    also the least distance between two of them, and `farthest`.  Where nine tenths of the points lie within `plate` of
+    a plane, it is the middle of a plate, which any points fit.
     """
 
     fits: float
     nearest: float
     farthest: float
+    plate: float
 
 
-EVENLY_SPREAD = Limits(fits=0.52, nearest=0.3, farthest=0.8)  # other points of such a surface have a mean of 0.37
-RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6)  # and of such a one 0.5; what is added lies in wide gaps
+# other points of the surface have a mean distance of 0.37 if they are even, 0.5 if random
+EVENLY_SPREAD = Limits(fits=0.52, nearest=0.3, farthest=0.8, plate=0.0)
+RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6, plate=1.5)
 
 
 class Surface(NamedTuple):
@@ -141,7 +143,7 @@ def find_planes(surface: Surface) -> list[Plane]:
 def halves_plate(surface: Surface, plane: Plane) -> bool:
     """Whether the points lie so near to the plane that any surface would fit its mirror image."""
     distance = np.abs(surface.position @ plane.normal - plane.offset)
-    return bool(np.quantile(distance, 0.9) < PLATE * surface.spacing)
+    return bool(np.quantile(distance, 0.9) < surface.limits.plate * surface.spacing)
 
 
 def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
