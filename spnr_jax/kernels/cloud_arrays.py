@@ -40,11 +40,14 @@ def strip(cloud: PointCloud) -> PointCloud:
     return jax.tree.map(lambda x: np.asarray(x)[mask], cloud)
 
 
-def bucket(count: int) -> int:
-    """The smallest of 512, 1024, 2048, ... that is not below `count`: few sizes, so few compilations."""
+def bucket(count: int, least: int = SMALLEST_BUCKET) -> int:
+    """The smallest of `least`, 2 least, 4 least, ... that is not below `count`: few sizes, so few compilations.
+
+    `least` is a power of two.
+    """
     if count < 1:
         raise UserError(f"a cloud needs at least 1 point, got {count}")
-    return max(SMALLEST_BUCKET, 1 << (count - 1).bit_length())
+    return max(least, 1 << (count - 1).bit_length())
 
 
 def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:

@@ -18,6 +18,7 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
@@ -57,7 +58,7 @@ def encode(
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
 
 
-def encode_in_box(cloud: PointCloud, least: int = 0) -> SurfelScene:
+def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScene:
     """Scene of a cloud in the box (unbatched), with centre 0 and scale 1; on the host, compiled once per padded size.
 
     The surfels are those of the unmasked points, sorted so that close points are close in memory, and padded, to
@@ -66,12 +67,12 @@ def encode_in_box(cloud: PointCloud, least: int = 0) -> SurfelScene:
     real = cloud_arrays.strip(cloud)
     real = jax.tree.map(np.float32, real).replace(mask=real.mask)
     order, near = order_in_space(real.positions)
-    size = max(cloud_arrays.bucket(len(order)), least)
+    size = cloud_arrays.bucket(len(order), least)
     neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
 
 
-def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = 0) -> PointCloud:
+def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
     """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier.
 
     Compiled once per padded size, which is `least` or more.
@@ -80,7 +81,7 @@ def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = 0) ->
     if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     real = symmetry.complete(cloud_arrays.strip(cloud))
-    padded = cloud_arrays.pad(real, max(cloud_arrays.bucket(len(real.mask)), least))
+    padded = cloud_arrays.pad(real, cloud_arrays.bucket(len(real.mask), least))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 

@@ -8,6 +8,7 @@ candidates  planes through the centroid, near which every plane of symmetry pass
 refinement  the reflected points are registered to the cloud (point-to-plane ICP, Chen and Medioni 1992)
 acceptance  around most points, the reflected ones lie as far from the nearest measured one as other points of the
             surface would; a reflected point far from all measured ones, as on a part of one side alone, is left out
+spacing     the points in the widest gaps are added first, and none close to another: gaps are filled, crowds not made
 
 NumPy on the host, for a cloud in the box: choices, without a gradient.  Lengths are in spacings unless stated.
 """
@@ -203,8 +204,6 @@ def space_out(
     position: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, " n"], least: float
 ) -> Int[np.ndarray, " kept"]:
     """Indices of points, those of the largest distance first, without those closer than `least` to one before."""
-    if not len(position):
-        return np.zeros(0, np.int64)
     near, free = cKDTree(position).query_ball_point(position, least), np.ones(len(position), bool)
     kept = np.zeros(len(position), bool)
     for point in np.argsort(-distance, kind="stable"):
