@@ -24,7 +24,7 @@ from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral
 
-FEWEST_POINTS, MOST_POINTS = 128, 2048  # of a cloud that is completed
+FEWEST_POINTS = 128  # of a cloud that is completed
 EVEN = 0.7  # mean distance to the nearest other point from which points are even (0.8; random ones 0.55)
 MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
 CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
@@ -38,7 +38,7 @@ UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected 
 
 
 class Limits(NamedTuple):
-    """Limits of the distance from a reflected point to the nearest measured one.
+    """Limits of the distance from a reflected point to the nearest measured one; `most_points` of a completed cloud.
 
     Up to a mean of `fits` over a neighborhood its points fit.  A reflected point is kept between `nearest`, which is
     also the least distance between two of them, and `farthest`.  Where nine tenths of the points lie within `plate` of
@@ -49,11 +49,12 @@ class Limits(NamedTuple):
     nearest: float
     farthest: float
     plate: float
+    most_points: int
 
 
 # other points of the surface have a mean distance of 0.37 if they are even, 0.5 if random
-EVENLY_SPREAD = Limits(fits=0.52, nearest=0.3, farthest=0.8, plate=0.0)
-RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6, plate=1.5)
+EVENLY_SPREAD = Limits(fits=0.52, nearest=0.3, farthest=0.8, plate=0.0, most_points=2048)
+RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6, plate=1.5, most_points=8192)
 
 
 class Surface(NamedTuple):
@@ -99,27 +100,39 @@ def complete(cloud: PointCloud) -> PointCloud:
     The same cloud if it has too few or too many points, or no symmetry.  Reflected points keep their material; where
     the surface has another color there are none, because a pattern need not be symmetric.
     """
-    if not FEWEST_POINTS <= len(cloud.mask) <= MOST_POINTS:
+    count = len(cloud.mask)
+    if count < FEWEST_POINTS or count > (limits := choose_limits(cloud)).most_points:
         return cloud
-    surface = measure_surface(cloud)
+    surface = measure_surface(cloud, limits)
     chosen: list[Plane] = []
     for plane in find_planes(surface):
         if len(chosen) < MOST_PLANES and all(abs(plane.normal @ other.normal) < ORTHOGONAL for other in chosen):
             chosen.append(plane)
     for number, plane in enumerate(chosen):
-        cloud = add_reflected(cloud, measure_surface(cloud) if number else surface, plane, surface.limits)
+        cloud = add_reflected(cloud, measure_surface(cloud, limits) if number else surface, plane)
     return cloud
 
 
-def measure_surface(cloud: PointCloud) -> Surface:
+def choose_limits(cloud: PointCloud) -> Limits:
+    """The limits for the points of a cloud, by their distances to the nearest other point."""
+    distance, _, spacing = measure_distances(cKDTree(cloud.positions))
+    return RANDOM if distance[:, 1].mean() < EVEN * spacing else EVENLY_SPREAD
+
+
+def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:
     """The points of a cloud with their normals, given or estimated."""
     position = np.asarray(cloud.positions, np.float64)
     tree = cKDTree(position)
-    distance, around = tree.query(position, list(range(1, AROUND + 1)))
-    spacing = max(float(np.median(distance[:, 1:7].mean(axis=1))), np.finfo(np.float64).tiny)
+    _, around, spacing = measure_distances(tree)
     normal = estimate_normals(position, position) if cloud.normals is None else np.asarray(cloud.normals, np.float64)
-    limits = RANDOM if distance[:, 1].mean() < EVEN * spacing else EVENLY_SPREAD
     return Surface(position, normal, spacing, limits, around, tree)
+
+
+def measure_distances(tree: cKDTree) -> tuple[Float[np.ndarray, "n 12"], Int[np.ndarray, "n 12"], float]:
+    """Distances to the nearest points of a tree, themselves first, the points' indices, and the median spacing."""
+    distance, around = tree.query(tree.data, list(range(1, AROUND + 1)))
+    spacing = float(np.median(distance[:, 1:7].mean(axis=1)))
+    return distance, around, max(spacing, np.finfo(np.float64).tiny)
 
 
 def find_planes(surface: Surface) -> list[Plane]:
@@ -183,9 +196,9 @@ def reflect(surface: Surface, normal: Float[np.ndarray, "3"], offset: float, cho
     return Reflection(reflected, normals, *match, np.minimum(distance[:, 0], FAR))
 
 
-def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane, limits: Limits) -> PointCloud:
+def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointCloud:
     """The cloud, then its points reflected in a plane, where they lie between measured points of their color."""
-    found = reflect(surface, plane.normal, plane.offset)
+    found, limits = reflect(surface, plane.normal, plane.offset), surface.limits
     roots = np.sqrt(np.maximum(cloud.base_color, 0))
     alike = np.linalg.norm(roots[found.match] - roots, axis=1) < UNLIKE
     fits = np.flatnonzero(alike & (found.distance > limits.nearest) & (found.distance < limits.farthest))

@@ -149,8 +149,8 @@ class Render(ReadOptions):
     """balanced: three quarters of the size, enlarged; draft: discs and light without the CNN.  The paper's network
     takes a quarter, half or all of its training samples per ray, near the points; trained: exactly as in training."""
     densify: bool = True
-    """Add learned points to clouds of at most 32,768 points, and reflected ones to symmetric clouds of at most 2,048:
-    sharper; films take up to three times as long."""
+    """Add learned points to clouds of at most 32,768 points, and reflected ones to small symmetric clouds: sharper;
+    films take up to three times as long."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """Files to write for each view; depth comes coloured and as .npy."""
     transparent: bool = False

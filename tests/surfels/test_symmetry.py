@@ -45,15 +45,19 @@ def sparse(points, count=1000, spread="even", **columns):
     return cloud(points[chosen], **{name: values[chosen] for name, values in columns.items()}), chosen
 
 
+def surface_of(one) -> symmetry.Surface:
+    return symmetry.measure_surface(one, symmetry.choose_limits(one))
+
+
 def spacing_of(one) -> float:
-    return symmetry.measure_surface(one).spacing
+    return surface_of(one).spacing
 
 
 @pytest.mark.parametrize(("count", "off"), [(1000, 0.05), (300, 0.15)])
 def test_the_plane_of_a_turned_chair_is_found(count, off):
     points, _ = chair()
     one, _ = sparse(points @ TURN.T + LEAN, count)
-    plane = symmetry.find_planes(symmetry.measure_surface(one))[0]
+    plane = symmetry.find_planes(surface_of(one))[0]
     true = TURN[:, 0]
     position = np.asarray(one.positions, float)
     wrong = [
@@ -170,10 +174,19 @@ def test_spaced_points_leave_no_room_for_others():
     assert len(symmetry.space_out(position[:0], distance[:0], 0.3)) == 0
 
 
-@pytest.mark.parametrize("count", [symmetry.FEWEST_POINTS - 1, symmetry.MOST_POINTS + 1])
-def test_very_few_and_many_points_stay_as_they_are(count):
-    one, _ = sparse(chair()[0], count)
-    assert symmetry.complete(one) is one
+@pytest.mark.parametrize(
+    ("count", "spread", "stays"),
+    [
+        (symmetry.FEWEST_POINTS - 1, "even", True),
+        (symmetry.EVENLY_SPREAD.most_points, "even", False),
+        (symmetry.EVENLY_SPREAD.most_points + 1, "even", True),
+        (symmetry.RANDOM.most_points, "random", False),
+        (symmetry.RANDOM.most_points + 1, "random", True),
+    ],
+)
+def test_very_few_and_many_points_stay_as_they_are(count, spread, stays):
+    one, _ = sparse(np.random.default_rng(0).permutation(chair()[0]), count, spread)
+    assert (symmetry.complete(one) is one) == stays
 
 
 @pytest.mark.parametrize("case", ["line", "plane", "place", "no normals", "helix"])
