@@ -101,7 +101,10 @@ def complete(cloud: PointCloud) -> PointCloud:
     the surface has another color there are none, because a pattern need not be symmetric.
     """
     count = len(cloud.mask)
-    if count < FEWEST_POINTS or count > (limits := choose_limits(cloud)).most_points:
+    if not FEWEST_POINTS <= count <= RANDOM.most_points:
+        return cloud
+    limits = choose_limits(cloud)
+    if count > limits.most_points:
         return cloud
     surface = measure_surface(cloud, limits)
     chosen: list[Plane] = []
