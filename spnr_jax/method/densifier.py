@@ -28,7 +28,9 @@ from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 from spnr_jax.surfels.layers import CONSTANTS
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
-SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims and on curves
+SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims, on curves
+# and in thin walls
+OPPOSED_COSINE, WALL_SHARE = -0.5, 0.2  # a thin wall: this share of the neighbors has normals below this cosine
 BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
 CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places
 NUM_NEAREST = 16  # nearest points from which a point is predicted
@@ -123,6 +125,9 @@ def propose(
     crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
     cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
     bent = (jnp.abs(height) + jnp.abs(there)) / reach + 1 - cosine > BENT
+    opposed = jnp.sum(real & (cosine < OPPOSED_COSINE), axis=1)
+    walled = opposed > WALL_SHARE * jnp.sum(real, axis=1)  # pairs across a wall would fill one side of it alone
+    bent = bent | walled[:, None] | walled[other]
     sparse = jnp.sum(neighbors[:, 0] >= 0) <= SPARSE
     between = squared[:, None] - products < -BETWEEN * size[:, None] * to_end
     blocked = jnp.any(between & (real & ~crosses_wall)[:, None], axis=2)

@@ -66,7 +66,7 @@ def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScen
     """
     real = cloud_arrays.strip(cloud)
     real = jax.tree.map(np.float32, real).replace(mask=real.mask)
-    order, near = order_in_space(real.positions)
+    order, near = order_in_space(real.positions, real.normals)
     size = cloud_arrays.bucket(len(order), least)
     neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)

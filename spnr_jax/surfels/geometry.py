@@ -48,30 +48,38 @@ from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 
 BLOCK = 2**14  # points per query of the k-d tree
+NEAREST = 32  # nearest points among which the neighbors of a point with a normal are chosen
+OPPOSED = 2.0  # spacings; a neighbor with the opposite normal counts as if it were this far off, at a right angle
 
 
 def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
     """Indices of the 20 nearest points of each point, itself first; -1 where there are fewer, and for padding.
 
+    Where normals are given, the 20 are chosen of the 32 nearest by a distance that grows with the angle between the
+    normals: the other side of a thin wall says nothing about how far apart the points of this side are.
     NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
     """
     positions, mask = np.asarray(cloud.positions), np.asarray(cloud.mask)
+    normals = None if cloud.normals is None else np.asarray(cloud.normals)
     found = np.full((*mask.shape, NEIGHBORS), -1, np.int32)
     for cloud_index in np.ndindex(mask.shape[:-1]):
         real = np.flatnonzero(mask[cloud_index])
         if len(real):
-            near = nearest(positions[cloud_index][real])
+            given = None if normals is None else normals[cloud_index][real]
+            near = nearest(positions[cloud_index][real], given)
             found[cloud_index][real] = np.where(near < 0, -1, real[near])
     return found
 
 
-def nearest(positions: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 20"]:
-    """Indices of the nearest points of real points, -1 where there are fewer; each point is its own first neighbor."""
-    return _query(cKDTree(positions), np.arange(len(positions)))
+def nearest(
+    positions: Float[np.ndarray, "points 3"], normals: Float[np.ndarray, "points 3"] | None = None
+) -> Int[np.ndarray, "points 20"]:
+    """`neighbors` of real points."""
+    return _query(cKDTree(positions), np.arange(len(positions)), normals)
 
 
 def order_in_space(
-    positions: Float[np.ndarray, "points 3"],
+    positions: Float[np.ndarray, "points 3"], normals: Float[np.ndarray, "points 3"] | None = None
 ) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "points 20"]]:
     """An order of the points that keeps close points close in memory, and the neighbors of the points in that order.
 
@@ -81,15 +89,23 @@ def order_in_space(
     order = tree.indices
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
-    near = _query(tree, order)
+    near = _query(tree, order, normals)
     return order, np.where(near < 0, np.int32(-1), rank[near])
 
 
-def _query(tree: cKDTree, queried: Int[np.ndarray, " some"]) -> Int[np.ndarray, "some 20"]:
+def _query(
+    tree: cKDTree, queried: Int[np.ndarray, " some"], normals: Float[np.ndarray, "points 3"] | None
+) -> Int[np.ndarray, "some 20"]:
     """Neighbors of the points with these indices, -1 for none; each point comes first, even among duplicates."""
-    ranks = list(range(1, min(NEIGHBORS, tree.n) + 1))
-    blocks = [queried[i : i + BLOCK] for i in range(0, len(queried), BLOCK)]
-    found = np.concatenate([tree.query(tree.data[rows], ranks, workers=-1)[1].astype(np.int32) for rows in blocks])
+    ranks = list(range(1, min(NEIGHBORS if normals is None else NEAREST, tree.n) + 1))
+
+    def query(rows: np.ndarray) -> np.ndarray:
+        distances, near = tree.query(tree.data[rows], ranks, workers=-1)
+        if normals is not None and len(ranks) > NEIGHBORS:
+            near = np.take_along_axis(near, _choose_facing(distances, near, rows, normals), axis=1)
+        return near.astype(np.int32)
+
+    found = np.concatenate([query(queried[i : i + BLOCK]) for i in range(0, len(queried), BLOCK)])[:, :NEIGHBORS]
     wrong = np.flatnonzero(found[:, 0] != queried)
     if len(wrong):
         own = found[wrong] == queried[wrong, None]
@@ -97,6 +113,22 @@ def _query(tree: cKDTree, queried: Int[np.ndarray, " some"]) -> Int[np.ndarray, 
         own[lost, -1], found[wrong[lost], -1] = True, queried[wrong[lost]]
         found[wrong] = np.take_along_axis(found[wrong], np.argsort(~own, axis=1, kind="stable"), axis=1)
     return np.pad(found, [(0, 0), (0, NEIGHBORS - found.shape[1])], constant_values=-1)
+
+
+def _choose_facing(
+    distances: Float[np.ndarray, "some 32"],
+    near: Int[np.ndarray, "some 32"],
+    queried: Int[np.ndarray, " some"],
+    normals: Float[np.ndarray, "points 3"],
+) -> Int[np.ndarray, "some 20"]:
+    """Which of the nearest points are neighbors, in the order of their distances; normals of length 0 oppose none."""
+    length = np.linalg.norm(normals, axis=1)
+    units, known = normals / np.maximum(length, 1e-12)[:, None], (length > 0).astype(np.float32)
+    cosine = np.einsum("nki,ni->nk", units[near], units[queried])
+    opposed = (known[near] * known[queried][:, None] - cosine) / 2
+    squared_spacing = np.pi / 6 * distances[:, 6:7] ** 2
+    farther = distances**2 + OPPOSED**2 * squared_spacing * opposed
+    return np.sort(np.argpartition(farther, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS], axis=1)
 
 
 # --- surfels ----------------------------------------------------------------------------------------------------------

@@ -140,6 +140,19 @@ def test_a_dense_cloud_gets_learned_points_where_it_ends_or_bends_alone(monkeypa
     assert ways[1] >= ways[0] > 20
 
 
+def test_both_sides_of_a_thin_wall_get_learned_points(monkeypatch):
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1).reshape(-1, 2) * 0.05
+    wall = np.concatenate([np.insert(grid, 2, 0, axis=1), np.insert(grid + 0.02, 2, -0.02, axis=1)])
+    normals = np.repeat([[0, 0, 1.0], [0, 0, -1.0]], 400, axis=0)
+    points = dataclasses.replace(cloud(wall), normals=np.float32(normals))
+    monkeypatch.setattr(densifier, "SPARSE", 0)
+    found = jax.jit(lambda *x: place_candidates(*x))(nodes_of(wall, normals, 0.05), spnr_jax.neighbors(points))
+    facing = normals[:, 2]
+    same = np.asarray(found.exists & (found.first != found.second)) & (facing[found.first] == facing[found.second])
+    for side in (1, -1):
+        assert (same & (facing[found.first] == side)).sum() > 400
+
+
 def test_padding_and_the_order_of_points_do_not_matter(params):
     points, order = ball(), np.random.default_rng(3).permutation(SIZE)
     whole = kept(run(params, points, spnr_jax.neighbors(points)))

@@ -191,6 +191,37 @@ def test_neighbors_are_the_nearest_of_the_real_points_and_each_is_its_own_first(
     np.testing.assert_array_equal(spnr_jax.neighbors(cloud(np.zeros((50, 3))))[:, 0], np.arange(50))
 
 
+def test_of_two_equally_near_points_the_one_that_faces_the_same_way_is_a_neighbor():
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(90, 3)) * (rng.random(90) > 0.2)[:, None]
+    points = dataclasses.replace(cloud(rng.normal(size=(90, 3))), normals=normals)
+    found = spnr_jax.neighbors(points)
+    plain = spnr_jax.neighbors(dataclasses.replace(points, normals=None))
+    assert (found != plain).any()
+    for i in range(90):
+        distance = np.linalg.norm(points.positions - points.positions[i], axis=1)
+        near = np.argsort(distance)[:32]
+        length = np.linalg.norm(normals[i]) * np.linalg.norm(normals[near], axis=1)
+        cosine = np.where(length > 0, normals[near] @ normals[i] / np.maximum(length, 1e-9), 1)
+        away = 2.0 * np.sqrt(np.pi / 6) * distance[near[6]] * np.sqrt(np.maximum(1 - cosine, 0) / 2)
+        chosen = near[np.argsort(np.hypot(distance[near], away))[:NEIGHBORS]]
+        np.testing.assert_array_equal(found[i], sorted(chosen, key=lambda j, d=distance: d[j]))
+
+
+def test_at_a_thin_wall_most_neighbors_of_points_with_normals_are_on_their_side():
+    grid = np.stack(np.meshgrid(np.arange(15), np.arange(15)), axis=-1).reshape(-1, 2)
+    wall = np.concatenate([np.insert(grid, 2, 0, axis=1), np.insert(grid + 0.3, 2, -0.2, axis=1)])
+    points = cloud(wall * 0.1)
+    normals = np.repeat(np.float32([[0, 0, 1], [0, 0, -1]]), len(grid), axis=0)
+    middle = np.abs(wall[:, :2] - 7).max(axis=1) < 4
+    shares = [
+        np.mean((wall[spnr_jax.neighbors(x)][..., 2] == wall[:, None, 2])[middle])
+        for x in (points, dataclasses.replace(points, normals=normals))
+    ]
+    assert shares[0] < 0.55
+    assert shares[1] > 0.62
+
+
 def count_programs():
     """Of `encode`: with a cache of compiled programs, and without one."""
     return len(surfel_method._encode.programs) + surfel_method._encode.jitted._cache_size()
