@@ -116,8 +116,8 @@ def _query(
 
 
 def _choose_facing(
-    distances: Float[np.ndarray, "some 32"],
-    near: Int[np.ndarray, "some 32"],
+    distances: Float[np.ndarray, "some nearest"],
+    near: Int[np.ndarray, "some nearest"],
     queried: Int[np.ndarray, " some"],
     normals: Float[np.ndarray, "points 3"],
 ) -> Int[np.ndarray, "some 20"]:

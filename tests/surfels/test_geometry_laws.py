@@ -191,14 +191,15 @@ def test_neighbors_are_the_nearest_of_the_real_points_and_each_is_its_own_first(
     np.testing.assert_array_equal(spnr_jax.neighbors(cloud(np.zeros((50, 3))))[:, 0], np.arange(50))
 
 
-def test_of_two_equally_near_points_the_one_that_faces_the_same_way_is_a_neighbor():
+@pytest.mark.parametrize("count", [25, 90])
+def test_of_two_equally_near_points_the_one_that_faces_the_same_way_is_a_neighbor(count):
     rng = np.random.default_rng(5)
-    normals = rng.normal(size=(90, 3)) * (rng.random(90) > 0.2)[:, None]
-    points = dataclasses.replace(cloud(rng.normal(size=(90, 3))), normals=normals)
+    normals = rng.normal(size=(count, 3)) * (rng.random(count) > 0.2)[:, None]
+    points = dataclasses.replace(cloud(rng.normal(size=(count, 3))), normals=normals)
     found = spnr_jax.neighbors(points)
     plain = spnr_jax.neighbors(dataclasses.replace(points, normals=None))
     assert (found != plain).any()
-    for i in range(90):
+    for i in range(count):
         distance = np.linalg.norm(points.positions - points.positions[i], axis=1)
         near = np.argsort(distance)[:32]
         length = np.linalg.norm(normals[i]) * np.linalg.norm(normals[near], axis=1)
