@@ -28,8 +28,7 @@ from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
 from spnr_jax.surfels.layers import CONSTANTS
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
-SPARSE = 8192  # points of a cloud up to which points are added everywhere; in larger clouds, only at rims, on curves
-# and in thin walls
+SPARSE = 8192  # points of a cloud up to which points are added everywhere; larger ones: rims, curves, thin walls
 OPPOSED_COSINE, WALL_SHARE = -0.5, 0.2  # a thin wall: this share of the neighbors has normals below this cosine
 BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
 CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places

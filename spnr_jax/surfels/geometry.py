@@ -1,6 +1,6 @@
 """Surfels from points: the surface around each point, estimated by one pure program over given neighbors.
 
-neighbors   the nearest points of each point, found once on the host with a k-d tree; integers without a gradient
+neighbors   near points of each point, found once on the host with a k-d tree; integers without a gradient
 spacing     side of the square that a point represents.  Three estimates follow each other: the raw spacing from 6
             neighbors on any layer, the spacing from the neighbors on the same layer, and its mean over 9 of these
 normal      given, or else that of the layer (layers.py); the outer side is found by votes (sides.py)
@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from spnr_jax.kernels import triangles
 from spnr_jax.kernels.numerics import (
     clamp,
     dot,
@@ -49,7 +50,7 @@ from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 BLOCK = 2**14  # points per query of the k-d tree
 NEAREST = 32  # nearest points among which the neighbors of a point with a normal are chosen
-OPPOSED = 2.0  # spacings; a neighbor with the opposite normal counts as if it were this far off, at a right angle
+OPPOSED = 2.0  # spacings added, in quadrature, to the distance of a neighbor with the opposite normal
 
 
 def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
@@ -98,11 +99,12 @@ def _query(
 ) -> Int[np.ndarray, "some 20"]:
     """Neighbors of the points with these indices, -1 for none; each point comes first, even among duplicates."""
     ranks = list(range(1, min(NEIGHBORS if normals is None else NEAREST, tree.n) + 1))
+    units = None if normals is None else triangles.unit(normals)
 
     def query(rows: np.ndarray) -> np.ndarray:
         distances, near = tree.query(tree.data[rows], ranks, workers=-1)
-        if normals is not None and len(ranks) > NEIGHBORS:
-            near = np.take_along_axis(near, _choose_facing(distances, near, rows, normals), axis=1)
+        if units is not None and len(ranks) > NEIGHBORS:
+            near = np.take_along_axis(near, _choose_facing(distances, units[near], units[rows]), axis=1)
         return near.astype(np.int32)
 
     found = np.concatenate([query(queried[i : i + BLOCK]) for i in range(0, len(queried), BLOCK)])[:, :NEIGHBORS]
@@ -117,15 +119,12 @@ def _query(
 
 def _choose_facing(
     distances: Float[np.ndarray, "some nearest"],
-    near: Int[np.ndarray, "some nearest"],
-    queried: Int[np.ndarray, " some"],
-    normals: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "some nearest 3"],
+    own: Float[np.ndarray, "some 3"],
 ) -> Int[np.ndarray, "some 20"]:
     """Which of the nearest points are neighbors, in the order of their distances; normals of length 0 oppose none."""
-    length = np.linalg.norm(normals, axis=1)
-    units, known = normals / np.maximum(length, 1e-12)[:, None], (length > 0).astype(np.float32)
-    cosine = np.einsum("nki,ni->nk", units[near], units[queried])
-    opposed = (known[near] * known[queried][:, None] - cosine) / 2
+    known = np.any(normals, axis=2) & np.any(own, axis=1)[:, None]
+    opposed = np.where(known, 1 - np.einsum("nki,ni->nk", normals, own), 0) / 2
     squared_spacing = np.pi / 6 * distances[:, 6:7] ** 2
     farther = distances**2 + OPPOSED**2 * squared_spacing * opposed
     return np.sort(np.argpartition(farther, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS], axis=1)

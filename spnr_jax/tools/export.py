@@ -271,7 +271,7 @@ def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *
 
 
 def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]) -> Int[Array, "points 20"]:
-    """`spnr_jax.neighbors` in JAX: the nearest points of each, itself first, -1 for none, by all distances."""
+    """`spnr_jax.neighbors` of points without normals, in JAX: by all distances."""
     positions, mask = jnp.asarray(positions), jnp.asarray(mask)
     count = min(NEIGHBORS, len(mask))
 
