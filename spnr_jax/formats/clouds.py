@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from spnr_jax.config import Cut
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Asset, ShownParts
-from spnr_jax.formats.columns import DEFAULTS, Columns, Report, keep_visible, materials, normals, sound, useful
+from spnr_jax.formats.columns import DEFAULTS, NORMAL, Columns, Report, keep_visible, materials, normals, sound, useful
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import bounding_box, sample_surface
@@ -32,6 +32,7 @@ from spnr_jax.kernels.cleaning import Clean, clean_columns
 from spnr_jax.kernels.cloud_arrays import (
     THINNING,
     farthest_points,
+    inner_box,
     measure_spacing,
     merge_repeats,
     require_surface,
@@ -183,7 +184,7 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
         values["normals"] = values["normals"] @ rotation.T
     origin = np.zeros(3)
     if _coarse(positions + before):
-        origin = np.floor((positions + before).min(axis=0))
+        origin = np.floor(inner_box(positions + before)[0])
         how.report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
     cloud = _float32((positions + (before - origin)) @ rotation.T, values)
     return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=origin)
@@ -212,8 +213,9 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
 
 def _coarse(positions: np.ndarray) -> bool:
     """Whether float32 is too coarse for positions (n, 3) where they lie."""
-    step = np.spacing(np.float32(np.abs(positions).max()))
-    return bool(step > COARSEST_STEP * np.ptp(positions, axis=0).max() > 0)
+    low, high = inner_box(positions)
+    step = np.spacing(np.float32(np.maximum(np.abs(low), np.abs(high)).max()))
+    return bool(step > COARSEST_STEP * (high - low).max() > 0)
 
 
 def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
@@ -291,9 +293,12 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     for axis, count, width in zip("xyz", counts, extent, strict=True):
         if 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
             report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
-    origin = np.floor(positions.min(axis=0)) if _coarse(positions) else np.zeros(3)
+    origin = np.floor(inner_box(positions)[0]) if _coarse(positions) else np.zeros(3)
     values, directions = materials(columns, report), normals(columns)
-    values |= {} if directions is None else {"normals": directions}
+    if directions is not None:
+        values["normals"] = directions
+    elif set(NORMAL) <= columns.keys():
+        report("normals of the file left out: none is a direction with a sign")
     places, values, merged = merge_repeats(positions - origin, values)
     if merged:
         report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
@@ -305,10 +310,11 @@ def _interpret(columns: Columns, how: Reading) -> Points:
 
 def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
     """A line where the file's columns round an axis coarsely or are degrees; ValueError where no shape is left."""
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    low, high = inner_box(positions)
     x, y, z = extent = high - low
-    short = [np.abs(column) if column.dtype.kind == "f" and column.dtype.itemsize <= 4 else None for column in columns]
-    steps = np.array([0.0 if column is None else float(np.spacing(column.max())) for column in short])
+    farthest = np.maximum(np.abs(low), np.abs(high))
+    short = [column.dtype if column.dtype.kind == "f" and column.dtype.itemsize <= 4 else None for column in columns]
+    steps = np.array([np.spacing(kind.type(far)) if kind else 0.0 for kind, far in zip(short, farthest, strict=True)])
     if steps.max() > LOST_STEP * extent.max() > 0:
         found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")

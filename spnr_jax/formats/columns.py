@@ -43,11 +43,15 @@ ALIASES = (  # ours first, then what stands for it: the first group that is ther
     (
         *("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "diffuse_r diffuse_g diffuse_b"),
         *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue"),
+        *("rgb:0 rgb:1 rgb:2", "rgb_0 rgb_1 rgb_2", "colors:0 colors:1 colors:2", "colors_0 colors_1 colors_2"),
     ),
-    ("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz"),
+    (
+        *("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz"),
+        *("normals:0 normals:1 normals:2", "normals_0 normals_1 normals_2"),
+    ),
     ("roughness", "rough", "roughness_factor", "pbr_roughness"),
     ("metallic", "metalness", "metallic_factor", "metal", "pbr_metallic"),
-    ("intensity", "reflectance"),
+    ("intensity", "reflectance", "reflectivity", "gray", "grey"),
     ("alpha", "a", "diffuse_alpha", "color_a"),
     *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
 )
@@ -56,7 +60,7 @@ SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
 STRAYS, LEAST = 1000, 100  # one value of so many may leave the range, of so many at least
 DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of the colours that is worth a line
-BRIGHTEST = 0.99  # quantile of the intensities that is shown white
+BRIGHTEST = 0.99  # quantile of the intensities that is shown white; as many are black
 SHORTEST = 1e-30  # normal that still has a direction
 FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog, and of other points
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
@@ -172,11 +176,16 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
         for line in found[1]:
             report(line)
         return found[0]
-    dark, bright = intensity.min(), np.quantile(intensity, BRIGHTEST)
-    if not (bright > dark and np.isfinite(intensity).all() and np.isfinite(bright - dark)):
+    known = np.isfinite(intensity)
+    if not known.any():
         return None
-    report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey")
-    return srgb_to_linear(np.repeat(np.clip((intensity - dark) / (bright - dark), 0, 1)[:, None], 3, axis=-1))
+    dark, bright = np.quantile(intensity[known], (1 - BRIGHTEST, BRIGHTEST))
+    if not 0 < bright - dark < np.inf:
+        return None
+    unknown = f", {int((~known).sum()):,} without one as 0.5" if not known.all() else ""
+    report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey{unknown}")
+    grey = np.where(known, np.clip((intensity - dark) / (bright - dark), 0, 1), 0.5)
+    return srgb_to_linear(np.repeat(grey[:, None], 3, axis=-1))
 
 
 def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
@@ -205,8 +214,9 @@ def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
 
 def _unpack(packed: np.ndarray) -> np.ndarray:
     """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats that have their bits."""
-    known = packed[np.isfinite(packed)]
-    whole = packed.itemsize == 8 and len(known) == len(packed) and bool(((known % 1 == 0) & (known >= 0)).all())
+    if packed.dtype == np.float64:  # which is wide enough for whole numbers, also with a sign
+        packed = np.nan_to_num(packed)
+    whole = packed.itemsize == 8 and bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())
     if packed.dtype.kind != "f" or whole:
         bits = packed.astype(np.int64).astype(np.uint32)
     else:

@@ -23,8 +23,8 @@ from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
-from spnr_jax.formats.columns import LINEAR, Columns
+from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels, make_material
+from spnr_jax.formats.columns import LINEAR, NORMAL, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -63,12 +63,12 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     """The scene's triangles with their materials, as they lie in the file."""
     file, ignored = GltfFile(path, loading), loading.ignored
     document, drawn = file.document, list(list_primitives(file.document))
+    for extension in document.get("extensionsRequired", []):
+        if extension not in (*READABLE, SPLATS) and not extension.startswith("KHR_materials_"):
+            raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
     if not loading.strict and (points := _points(file, drawn)):
         loading.points = points
         return []
-    for extension in document.get("extensionsRequired", []):
-        if extension not in READABLE and not extension.startswith("KHR_materials_"):
-            raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
     ignored |= {key for key in ("animations", "skins") if document.get(key)}
     ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
     read_look = cache(partial(read_material, file))
@@ -130,14 +130,23 @@ def _points(file: "GltfFile", drawn: list[tuple[dict, np.ndarray]]) -> Columns |
     if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
         return None
     pieces: list[Columns] = []
+    colored = False
     for primitive, matrix in (pair for pair in drawn if pair[0].get("mode") == 0):
         if SPLATS in primitive.get("extensions", {}):
             raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
-        columns = file.columns(primitive["attributes"], "POSITION", "COLOR_0")
-        pieces.append(dict(zip("xyz", (columns["POSITION"] @ matrix[:3, :3].T + matrix[:3, 3]).T, strict=True)))
-        if "COLOR_0" in columns:
-            pieces[-1] |= dict(zip((*LINEAR, "alpha"), columns["COLOR_0"].T, strict=False))
-    shared = [name for name in pieces[0] if all(name in piece for piece in pieces)]
+        columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0")
+        part = _place(columns, np.zeros((0, 3), np.int64), make_material(), Placement(), matrix)
+        look = file.document["materials"][primitive["material"]] if "material" in primitive else {}
+        factor = look.get("pbrMetallicRoughness", {}).get("baseColorFactor")
+        colored |= factor is not None or part.colors is not None
+        rgba = columns.get("COLOR_0", np.ones((len(part.positions), 4)))
+        rgba = rgba * (factor or (1, 1, 1, 1))[: rgba.shape[1]]
+        values = zip((*"xyz", *LINEAR, "alpha"), (*part.positions.T, *rgba.T), strict=False)
+        found = dict(values) | dict(zip(NORMAL, () if part.normals is None else part.normals.T, strict=False))
+        rows = file.accessor(primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive else slice(None)
+        pieces.append({name: column[rows] for name, column in found.items()})
+    left_out = () if colored else LINEAR
+    shared = [name for name in pieces[0] if all(name in piece for piece in pieces) and name not in left_out]
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in shared}
 
 

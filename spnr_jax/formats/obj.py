@@ -23,7 +23,9 @@ Rests = dict[str, list]
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 READ = {"kd", "pr", "pm", "ns", "d", "tr", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
-OPTION = re.compile(r"-(\w+)((?:\s+(?:on|off|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+")
+OPTION = re.compile(
+    r"-(\w+)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+"
+)
 
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
@@ -31,7 +33,9 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     text = _parse(path.read_text("utf-8-sig", errors="replace"))
     if not (text["f sizes"] or text["v"]):
         raise UserError("has no faces, and no vertices")
-    columns = _columns(text)
+    if text["surf"] and not text["f sizes"]:
+        raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
+    columns = _columns(text, loading)
     if not text["f sizes"]:
         loading.points = columns
         return []
@@ -47,6 +51,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         if colors is not None and name not in library:  # what has colours of its own is not multiplied with grey
             looks[name] = make_material(1.0)
     parts = _parts(text, stack_columns(columns), colors, looks, loading)
+    if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
+        loading.ignored.add(f"{loose:,} vertices of no face")
     if text["vn"] and any(part.normals is None for part in parts):
         loading.ignored.add("normals that only some faces have (flat shading is used)")
     loading.say(*notes)
@@ -55,7 +61,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 def _parse(content: str) -> Rests:
     """The rests of lines by their keyword; of faces all corners, words like 1/2/3 from 1, sizes and materials."""
-    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "usemtl", "mtllib")}
+    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "usemtl", "mtllib", "surf")}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     for line in content.replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
@@ -80,12 +86,20 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
     return np.loadtxt(rows, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
 
 
-def _columns(text: Rests) -> Columns:
-    """The columns of the vertices: positions, colours where every row has them, normals where no face does."""
+def _columns(text: Rests, loading: Loading) -> Columns:
+    """The columns of the vertices: positions, colours where some row has them, normals where no face does."""
     try:
         table = _table(text["v"], None)
     except ValueError:  # rows of different lengths
         table = _table(text["v"], 3)
+        with_color = np.array([len(row.partition("#")[0].split()) >= 6 for row in text["v"]])
+        if with_color.any():
+            some = _table([row for row, has in zip(text["v"], with_color, strict=True) if has], 6)[:, 3:]
+            table = np.concatenate([table, np.broadcast_to(some.mean(axis=0), table.shape)], axis=1)
+            table[with_color, 3:] = some
+            loading.say(f"{np.sum(~with_color):,} of {len(table):,} vertices have no colour: the others' mean is taken")
+    if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
+        table = np.delete(table, 3, axis=1)
     columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
     if not text["f sizes"] and len(text["vn"]) == len(table):
         columns |= dict(zip(NORMAL, _table(text["vn"], 3).T, strict=True))
@@ -174,7 +188,7 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Material
             options[option[1]] = option[2].split()
             statement = statement[option.end() :]
         ignored |= {f"MTL map option -{option}" for option in options if option != "clamp"}
-        file = statement.strip().replace("\\", "/")
+        file = statement.strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
             maps[key] = texels
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap

@@ -49,6 +49,7 @@ TEXTS = (
     (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
+COLMAP = "convert it to .ply with `colmap model_converter --output_type PLY`"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
 # first bytes or suffix -> what it is, where its version stands (as struct has it), how to convert it
 FOREIGN: dict[bytes | str, tuple] = {
@@ -56,13 +57,20 @@ FOREIGN: dict[bytes | str, tuple] = {
     b"#usda": ("USD (text)", "6x3s", BLENDER),
     b"ASTM-E57": ("an E57 scan", "<8x2I", CLOUDCOMPARE),
     b"version https://git-lfs": ("a pointer to a file that Git LFS keeps", None, "fetch it with `git lfs pull`"),
+    b"ncols": ("a grid of heights (ESRI ASCII)", None, "convert it with `gdal_translate -of XYZ`"),
+    b"# 3D point list": ("points of COLMAP", None, COLMAP),
     **dict.fromkeys((b"<!doctype html", b"<!DOCTYPE html", b"<html"), ("a web page", None, "download the file itself")),
     **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff", b"%PDF"), ("a picture or document", None, "give points or a mesh")),
     b"Kaydara FBX Binary": ("an FBX scene", "<23xI", BLENDER),
     ".usdz": ("USD (package)", None, BLENDER),
     **dict.fromkeys((".usd", ".usda", ".usdc"), ("USD", None, BLENDER)),
     ".e57": ("an E57 scan", None, CLOUDCOMPARE),
-    **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls", ".bin"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
+    **dict.fromkeys((".ptx", ".rcp", ".rcs", ".fls"), ("a scan of its maker's own kind", None, CLOUDCOMPARE)),
+    ".bin": (
+        "a binary file of one program",
+        None,
+        f"of COLMAP, {COLMAP}; of CloudCompare, save it there as .las or .ply",
+    ),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz"), ("an archive", None, "unpack it first")),

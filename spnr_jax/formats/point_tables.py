@@ -2,11 +2,12 @@
 
 Numbers of text are separated by commas, semicolons or blanks, also behind the last one; a decimal comma is told by that
 nothing else separates there.  Lines of one whole number count the points.  A header line names the columns, also behind
-# or //, with units in brackets; a column without a name is a table's index.  Without a header the number of columns
-tells, and for normals their values:
+#, % or //, with units in brackets; a column without a name is a table's index.  Without a header the number of columns
+tells, behind one that only counts, and for normals and colours their values:
 
-    3 x y z | 4 + intensity | 6 + r g b, or + nx ny nz if these have length 1 | 7 + r g b alpha or intensity r g b
-    8 + r g b roughness metallic | 9 + r g b and nx ny nz in either order
+    3 x y z | 4 + intensity | 6 + r g b, or + nx ny nz if these have length 1 | 7 + r g b alpha, r g b and any number,
+    or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
+    9 + r g b and nx ny nz in either order
 
     .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
@@ -38,11 +39,12 @@ NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
 PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
-COMMENTS = ("#", "//")
+COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
-EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;])")  # a number that was not known
+EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)", re.IGNORECASE)  # as the libraries of Windows write it
+UNITS = re.compile(r"[(\[][^)\]]*[)\]]")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
@@ -67,36 +69,41 @@ def text_pieces(path: Path) -> Iterator[Columns]:
         if not first[1]:
             raise UserError(f"holds 0 points: no row of numbers, only {header[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
-        parts = first[1].strip("; \t").split(";") if delimiter == ";" else first[1].split()
-        comma = len(parts) > 2 and "," in first[1] and all(WITH_COMMA.fullmatch(x.strip()) for x in parts if x)
-        delimiter = None if comma and delimiter == "," else delimiter
+        parts = first[1].split()
+        if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
+            delimiter = None  # these are decimal commas
+        trailing = ""  # separators behind the last number, which are none before one that is not known
+        if delimiter and first[1].endswith(delimiter):
+            of_header = header.rstrip(delimiter).count(delimiter)
+            trailing = delimiter if of_header != first[1].count(delimiter) else ""
         lines = (
             (number, plain)
             for number, text in chain([first], numbered)
-            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := _plain(text, delimiter, comma))
+            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := _plain(text, delimiter, trailing))
         )
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
             count = len(names) or len(rows[0][1].split(delimiter))
             table = load_text(rows, "line", count, delimiter, ndmin=2)
-            names = names or _names(header, is_comment, table)
+            names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
 
 
-def _plain(text: str, delimiter: str | None, comma: bool) -> str:
+def _plain(text: str, delimiter: str | None, trailing: str) -> str:
     """A row with decimal points, without separators behind the last number."""
-    text = text.rstrip(" \t" + (delimiter or ""))
+    text = text.rstrip(" \t" + trailing)
     text = EMPTY.sub("nan", text) if delimiter else text
-    return text.replace(",", ".") if comma else text
+    return text if delimiter == "," else text.replace(",", ".")
 
 
 def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
     """What stands before the numbers last, whether as a comment, and the first row of numbers (0, "" if none)."""
     header, is_comment = "", True
     for number, line in lines:
-        text = re.sub(r"^(#|//)\s*", "", line)
+        text = re.sub(r"^(#|//|%)\s*", "", line)
         if text and not NUMBER.fullmatch(re.split(r"[\s;,]+", text)[0]):
-            header, is_comment = text[:LONGEST_HEADER], text != line
+            if re.search(r"\w", UNITS.sub("", text[:LONGEST_HEADER])):
+                header, is_comment = text[:LONGEST_HEADER], text != line
         elif text and text == line and not text.isdecimal():
             return header, is_comment, (number, line)
     return header, is_comment, (0, "")
@@ -128,10 +135,10 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 
-def _names(header: str, is_comment: bool, table: np.ndarray) -> tuple[str, ...]:
+def _names(header: str, is_comment: bool, table: np.ndarray, intensity_first: bool) -> tuple[str, ...]:
     """Names of the columns of a table from its header, or if that is a remark, from the numbers."""
     count, names = table.shape[1], [""]
-    plain = re.sub(r"[(\[][^)\]]*[)\]]", "", header)  # units
+    plain = UNITS.sub("", header)
     for mark in (*(mark for mark in ";," if mark in plain), r"[\s,;]+"):
         names = [name.strip("\"' \t").lower() for name in re.split(mark, plain)]
         while len(names) > count and not names[-1]:
@@ -142,21 +149,28 @@ def _names(header: str, is_comment: bool, table: np.ndarray) -> tuple[str, ...]:
             break
     known, fits = "x" in names, len(names) == count
     if not (known and fits) and (is_comment or not (known or fits)):  # a remark
-        return plain_names(table)
+        return plain_names(table, intensity_first)
     if not fits:
         raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
-    return tuple(name or INDEX for name in names)
+    return tuple(INDEX if not name or name in names[:number] else name for number, name in enumerate(names))
 
 
-def plain_names(table: np.ndarray) -> tuple[str, ...]:
-    """Names of the columns of a table (points, columns) that has none."""
+def plain_names(table: np.ndarray, intensity_first: bool = False) -> tuple[str, ...]:
+    """Names of the columns of a table (points, columns) that has none.
+
+    `intensity_first` tells where both the first and the last three of four numbers could be a colour.
+    """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
+    if 3 < count < 11 and len(table) > 2 and np.all(np.diff(table[:, 0]) == 1):
+        return (INDEX, *plain_names(table[:, 1:], intensity_first))
     first = NORMAL if count in (6, 9) and _are_normals(table[:, 3:6]) else COLOR
     more = {3: (), 4: ("intensity",), 6: first, 8: (*COLOR, "roughness", "metallic")}
     more[9] = (*first, *(NORMAL if first == COLOR else COLOR))
     if count == 7:
         alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
-        more[7] = (*COLOR, "alpha") if alpha_last else ("intensity", *COLOR)
+        starts, ends = _are_colors(table[:, 3:6]), _are_colors(table[:, 4:])
+        color_first = starts and not (ends and intensity_first)
+        more[7] = (*COLOR, "alpha") if alpha_last else (*COLOR, "scalar") if color_first else ("intensity", *COLOR)
     if count not in more:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, "
@@ -170,6 +184,13 @@ def _are_normals(vectors: np.ndarray) -> bool:
     """Whether vectors (n, 3) have length 1, up to rounding, and are not all in the octant of colours."""
     lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
     return bool((vectors < 0).any() and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
+
+
+def _are_colors(values: np.ndarray) -> bool:
+    """Whether values (n, 3) are 0 to 1, or whole ones of at most 16 bits, and no channel outshines the others."""
+    highest = values.max(axis=0)
+    whole = highest.max() <= OPAQUE[-1] and np.all(values % 1 == 0)
+    return bool(values.min() >= 0 and highest.min() >= highest.max() / 16 and (whole or highest.max() <= 1))
 
 
 # --- NumPy ------------------------------------------------------------------------------------------------------------
@@ -187,7 +208,9 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         raise UserError("is not a NumPy file")
     with refusing("is a broken, truncated or pickled NumPy file"), _parsing():
         rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
-    if rows.ndim == 3:  # the pixels of a picture
+    if rows.ndim == 3 and rows.dtype == np.uint8:
+        raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
+    if rows.ndim == 3:  # the pixels of a camera that sees depth
         rows = rows.reshape(-1, rows.shape[2])
     names = rows.dtype.names or plain_names(rows)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))

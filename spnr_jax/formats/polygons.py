@@ -3,7 +3,7 @@
 .ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have
 .stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
         the file counts where the count is 0
-.off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]
+.off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
 """
 
 import io
@@ -21,7 +21,7 @@ from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF\b([^\S\n]*\n)?")
+OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF\b(?!\s+BINARY)([^\S\n]*\n)?")
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
@@ -46,14 +46,15 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
 def load_stl(path: Path, loading: Loading) -> list[Part]:
     """The part of an STL file."""
     data = path.read_bytes()
-    if re.match(rb"\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
+    announced = int.from_bytes(data[80:STL_HEAD], "little")
+    whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # whatever the header says
+    if not whole and re.match(rb"\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
         corners = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
         if len(corners) % 9:
             raise UserError(f"is cut off: {len(corners)} coordinates, where each triangle has 9")
     else:
         if len(data) < STL_HEAD:
             raise UserError(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
-        announced = int.from_bytes(data[80:84], "little")
         held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
         if announced > held:
             raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
@@ -76,7 +77,7 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     num_vertices, num_faces, *_ = (*(int(word) for word in counts.split()[:2]), 0, 0)
     if not counts or min(num_vertices, num_faces) < 0 or len(rows) < num_vertices + num_faces:
         raise UserError(f"is cut off: {num_vertices} vertices and {num_faces} faces announced, {len(rows)} lines found")
-    names = [*"xyz", *(NORMAL if head[2] else ()), *((*SRGB, "alpha") if head[1] else ())]
+    names = [*"xyz", *(NORMAL if head[2] else ()), *SRGB, "alpha"]
     table = np.loadtxt(rows[:num_vertices], ndmin=2) if num_vertices else np.zeros((0, 3))
     columns = dict(zip(names, table.T, strict=False))
     faces = [[float(word) for word in row.split()] for row in rows[num_vertices:][:num_faces]]
@@ -104,6 +105,8 @@ def _colored(
     """The part of polygons of so many corners, with the colours of their vertices, else those of the polygons."""
     columns = useful(vertices)
     positions = stack_columns(columns)
+    if loose := len(positions) - len(np.unique(corners)):
+        loading.ignored.add(f"{loose:,} vertices of no face")
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     colors, notes = colors_of(columns) or (None, [])

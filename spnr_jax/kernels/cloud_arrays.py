@@ -85,6 +85,7 @@ NEAR = 1e-3  # times the median spacing
 AROUND, SAMPLE = 128, 1024  # neighbours that determine the spacing; points at which it is estimated
 FEW = 8  # distinct points: with fewer, the spacing is meaningless
 PLACE = 1e-6  # of the extent: closer points share one place
+CROWDED = 64  # nearly equal points around each, above which one stands for all in a voxel
 LINE = 1e-13  # largest variance of a line across it, as a share of that along it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
@@ -118,10 +119,15 @@ def _label_repeats(positions: np.ndarray) -> np.ndarray:
     if len(distinct) < FEW:
         return rows
     tree = cKDTree(distinct)
-    pairs = tree.query_pairs(NEAR * measure_spacing(tree), output_type="ndarray")
+    near = NEAR * measure_spacing(tree)
+    if tree.count_neighbors(tree, near) > CROWDED * len(distinct):  # more pairs than fit into the memory
+        voxels = np.floor((distinct - distinct.min(axis=0)) / (near / 2))
+        _, first, of_voxel = np.unique(voxels, axis=0, return_index=True, return_inverse=True)
+        tree, rows = cKDTree(distinct[first]), of_voxel.ravel()[rows]
+    pairs = tree.query_pairs(near, output_type="ndarray")
     if not len(pairs):
         return rows
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(distinct),) * 2)
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(tree.n,) * 2)
     return connected_components(graph, directed=False)[1][rows]
 
 
@@ -159,6 +165,7 @@ def _group_means(column: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 def require_surface(positions: Float[np.ndarray, "points 3"], before: int) -> None:
     """ValueError if points (n, 3), originally `before`, span no surface: one place, two places, or a line."""
+    positions = np.clip(positions, *inner_box(positions))
     extent = float(np.ptp(positions, axis=0).max())
     steps = np.round((positions - positions.min(axis=0)) / max(PLACE * extent, np.finfo(np.float64).tiny))
     places = 1 if extent == 0 else len(np.unique(steps, axis=0)) if len(positions) < FEW**4 else FEW
@@ -234,9 +241,15 @@ def voxel_keys(positions: np.ndarray, voxel: float) -> np.ndarray:
     return (x << 2 * KEY_BITS) | (y << KEY_BITS) | z
 
 
+def inner_box(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of the box that holds most of the positions (n, 3); all, where most of them coincide."""
+    low, high = np.quantile(positions, INNER, axis=0)
+    return (low, high) if (high > low).any() else (positions.min(axis=0), positions.max(axis=0))
+
+
 def find_extent(positions: np.ndarray) -> tuple[np.ndarray, float]:
     """Corner (3,) and side of a cube that holds most of the positions (n, 3)."""
-    low, high = np.quantile(positions, INNER, axis=0)
+    low, high = inner_box(positions)
     return low, max(float((high - low).max()), SMALLEST_EXTENT)
 
 

@@ -336,7 +336,7 @@ class Viewer:
         self.lines += [f"reached at {reached_at}: http(s)://{reached_at}/{token}/"] if reached_at else []
         self.lines += [EXPOSED.format(host=host, port=port, name=first.name)] if host not in LOOPBACK else []
         self._set_up_page()
-        threading.Thread(target=self._warm_up, daemon=True).start()
+        threading.Thread(target=self._warm_up).start()  # no daemon: Python's end crashes of what JAX still compiles
 
     def wait(self) -> None:
         """Serve until Ctrl-C."""

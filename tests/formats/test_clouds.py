@@ -75,7 +75,10 @@ def test_roughness_and_metallic_have_many_names_and_whole_bytes(tmp_path, rough,
 def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is(tmp_path):
     base_color, *_, lines = materials(tmp_path, scalar_intensity=[100, 300, 300])
     np.testing.assert_allclose(base_color[:, 0], [0, 1, 1], atol=0.01)
-    assert lines[0].startswith("no colour in the file: intensity 100..")
+    assert lines[0].startswith("no colour in the file: intensity 104..300 shown as grey")
+    cloud, lines = read(write_rows(tmp_path, spiral(402), intensity=[np.nan, -9999, *np.linspace(100, 300, 400)]))
+    np.testing.assert_allclose(cloud.base_color[[0, 1, 2, -1], 0], [0.214, 0, 0, 1], atol=0.01)
+    assert "no colour in the file: intensity 101.504..297.995 shown as grey, 1 without one as 0.5" in lines
     base_color, *_ = materials(tmp_path, intensity=[100, 300, 200], red=[1.0] * 3, green=[0.0] * 3, blue=[0.0] * 3)
     np.testing.assert_array_equal(base_color, [[1, 0, 0]] * 3)
     none_seen = materials(tmp_path, intensity=[100, 300, 200], red=[0] * 3, green=[0] * 3, blue=[0] * 3)

@@ -16,6 +16,8 @@ from support.point_clouds import BALL, GREEN, LINEAR, read, write, write_rows
 
 from spnr_jax.config import Cut
 from spnr_jax.formats.clouds import place_cloud, read_cloud
+from spnr_jax.kernels import cloud_arrays
+from spnr_jax.kernels.cloud_arrays import merge_repeats
 from spnr_jax.kernels.triangles import ears
 from spnr_jax.surfels.sides import spiral
 
@@ -30,6 +32,18 @@ def test_points_of_a_scene_lie_where_their_nodes_put_them_and_splats_are_refused
     points = builder.primitive(BALL.astype("f4"), None, mode=0)
     builder.mesh(points, scale=[2, 2, 2])
     np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, 2 * BALL, atol=1e-6)
+    turned = builder.primitive(
+        BALL.astype("f4"), np.arange(3, dtype="u2"), mode=0, NORMAL=BALL.astype("f4"), material=0
+    )
+    builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}}]
+    builder.mesh(turned, rotation=[0, 0, 0.5**0.5, 0.5**0.5])
+    (cloud, _), turn = read(builder.write(tmp_path / "a.glb")), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(cloud.positions[420:], BALL[:3] @ np.transpose(turn), atol=1e-6)
+    np.testing.assert_allclose(cloud.base_color, [*420 * [[1, 1, 1]], *3 * [LINEAR]], atol=1e-6)
+    assert cloud.normals is None
+    points["attributes"]["NORMAL"] = turned["attributes"]["NORMAL"]
+    normals = read(builder.write(tmp_path / "a.glb"))[0].normals
+    np.testing.assert_allclose(normals[[0, 1, 420]], [*BALL[:2], BALL[0] @ np.transpose(turn)], atol=1e-3)
     points["extensions"] = {extension: {"colorSpace": "lin_rec709_display"}}
     with pytest.raises(ValueError, match=rf"Gaussian splats \({extension}\), which are not read: convert it to .ply"):
         read_cloud(builder.write(tmp_path / "a.glb"))
@@ -90,6 +104,9 @@ COLORED_MESHES = {
     "r g b": ("a.ply", square_ply("uchar", "rgb", GREEN)),
     "packed": ("a.ply", square_ply("uint", ["rgb"], [PACKED])),
     "COFF": ("a.off", "COFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255\n" for c in CORNERS) + "4 0 1 2 3\n"),
+    "OFF with colours": ("a.off", "OFF\n4 1 0\n" + "".join(f"{c} 40 170 60\n" for c in CORNERS) + "4 0 1 2 3\n"),
+    "OBJ, weights of the vertices": ("a.obj", "".join(f"v {c} 1 40 170 60\n" for c in CORNERS) + OBJ_FACE),
+    "OBJ, a vertex without colour": ("a.obj", "".join(f"v {c} 40 170 60\n" for c in CORNERS) + "v 0 0 0\n" + OBJ_FACE),
     "OFF, colours of faces": ("a.off", "OFF\n4 1 0\n" + "\n".join(CORNERS) + "\n4 0 1 2 3 40 170 60\n"),
     "triangles and a polygon of four corners": (
         "a.ply",
@@ -112,6 +129,7 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
     cloud, lines = read(write(tmp_path, *COLORED_MESHES[case]), num_points=50)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (50, 3)), atol=2e-3)
     assert any("taken as sRGB in 0.." in line for line in lines)
+    assert ("ignored: 1 vertices of no face" in lines) == ("a vertex without" in case)
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
@@ -133,6 +151,7 @@ LIBRARIES = (
     "\ufeffnewmtl a\nKd 0.25 0.25 0.25\n",
     "newmtl a\nKd 0.25 0.25 0.25 # grey\nNs 10 # dull\n",
     "newmtl a\nKd 0.25\n",
+    'newmtl a\nmap_Kd -type sphere -imfchan r "gone.png"\nKd 0.25\n',
     "newmtl a\nKd 63.75 63.75 63.75\n",
 )
 
@@ -233,6 +252,17 @@ def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
         np.testing.assert_allclose(back, 0.3 * BALL + UTM, rtol=0, atol=1e-6)
 
 
+def test_a_stray_point_far_away_takes_no_digit_of_the_others(tmp_path):
+    for count in (420, 5000):
+        for ball, stray in ((spiral(count) + UTM, np.zeros(3)), (spiral(count), np.full(3, 1e7))):
+            np.save(tmp_path / "a.npy", np.vstack([ball, stray]))
+            placed = place_cloud(tmp_path / "a.npy", up="y")
+            np.testing.assert_allclose(placed.cloud.positions[:count] + placed.origin, ball, rtol=0, atol=1e-6)
+    np.save(tmp_path / "a.npy", np.vstack([BALL + UTM, np.zeros(3)]).astype("f4"))
+    with pytest.raises(ValueError, match=r"0\.5 apart at best in float32, for an extent of 2"):
+        read(tmp_path / "a.npy")
+
+
 ROUNDED, LEFT_OUT = (
     np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]]),
     "normals of the file left out: ",
@@ -289,6 +319,17 @@ def test_repeats_are_merged_before_anything_looks_at_neighbours(tmp_path, jitter
     assert "2,100 of 2,520 points repeat others, and were merged with them" in lines
 
 
+def test_crowds_of_nearly_equal_points_are_merged_as_pairs_are(monkeypatch):
+    rng = np.random.default_rng(0)
+    crowds = np.repeat(BALL, 6, axis=0) + 1e-6 * rng.uniform(-1, 1, (2520, 3))
+    by_pairs = merge_repeats(crowds, {})
+    monkeypatch.setattr(cloud_arrays, "CROWDED", 0)
+    np.testing.assert_array_equal(merge_repeats(crowds, {})[0], by_pairs[0])
+    monkeypatch.undo()
+    one = 1e-7 * rng.normal(size=(20_000, 3))  # whose pairs would take 3 GB
+    assert merge_repeats(np.concatenate([one, spiral(30_000)]), {})[2] > 19_900
+
+
 # Meshes
 
 
@@ -327,6 +368,11 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
     assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
     with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
         read(write(tmp_path, "a.stl", stl(3)))
+
+
+def test_a_binary_stl_may_begin_as_one_of_text_does(tmp_path):
+    content = b"solid of a facet".ljust(80, b"\0") + stl(2)[80:]
+    assert len(read(write(tmp_path, "a.stl", content), num_points=9)[0].positions) == 9
 
 
 def test_a_text_stl_in_capitals_is_none_of_bytes(tmp_path):

@@ -78,13 +78,15 @@ ROWS = [(*point, *GREEN) for point in BALL.tolist()]
 
 
 def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
-    text = "\n".join(separator.join(f"{value:g}" for value in row) + end for row in columns) + "\n"
+    text = "\n".join(separator.join(f"{value:.9g}" for value in row) + end for row in columns) + "\n"
     return text.replace(".", ",") if comma else text
 
 
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
 BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+PARAVIEW = [(*GREEN, *row[:3]) for row in ROWS]
+PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
@@ -99,6 +101,15 @@ TEXTS = {
     "count line, semicolons": ("a.xyz", "420\n" + table(";")),
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
     "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
+    "a number before each point": ("a.csv", table(",", columns=INDEXED)),
+    "a label behind the colour": ("a.txt", table(" ", columns=[(*row, i % 40) for i, row in enumerate(ROWS)])),
+    ".pts with an intensity like a colour": ("a.pts", table(" ", columns=[(*row[:3], 90, *GREEN) for row in ROWS])),
+    "the last field not known": ("a.csv", "x,y,z,r,g,b,intensity\n" + table(",", ",")),
+    "a line of units below the names": ("a.csv", "x,y,z,r,g,b\n[m],[m],[m],[],[],[]\n" + table(",")),
+    "names behind %": ("a.txt", "% b g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "a name twice": ("a.csv", "x,y,z,r,g,b,x\n" + table(",", columns=PCV)),
+    "ParaView": ("a.csv", '"RGB:0","RGB:1","RGB:2",Points:0,Points:1,Points:2\n' + table(",", columns=PARAVIEW)),
+    "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
     "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
     "units, blanks between": ("a.txt", "X[m] Y[m] Z[m] R G B\n" + table(" ")),
     "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
@@ -267,6 +278,16 @@ REFUSED = [
     ("a.ply", None, "no such file"),
     ("a.xyz", "", "the file is empty"),
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
+    (
+        "points3D.txt",
+        "# 3D point list with one line of data per point:\n",
+        "points of COLMAP, .* .colmap model_converter",
+    ),
+    ("points3D.bin", b"\1", "a binary file of one program, which is not read: of COLMAP, "),
+    ("a.asc", "ncols 6\nnrows 2\n", "a grid of heights"),
+    ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
+    ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
+    ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
     ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
     ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS .*git lfs pull"),
     ("a.ply", "<!DOCTYPE html>", "a web page, which is not read"),
@@ -291,7 +312,7 @@ REFUSED = [
     ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
     ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
     ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
-    ("a.ply", ply_bytes(LITTLE, rows=DEEP, properties=XYZRGB[:3]), "0.5 apart at best .* extent of 1; move them"),
+    ("a.ply", ply_bytes(LITTLE, rows=DEEP, properties=XYZRGB[:3]), "0.5 apart at best .* extent of 0.9; move"),
     ("a.ply", ply_bytes(LITTLE)[:-20], "announces 3 points, the data ends after 2"),
     ("a.obj", "v 0 0 0\n", "holds 1 points in 1 place"),
     ("b.obj", "# nothing\n", "no faces, and no vertices"),
