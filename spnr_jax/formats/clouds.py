@@ -148,6 +148,8 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
 
         asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
         pieces = None if asset.points is None else iter([asset.points])
+        for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
+            how.report(line)
     points = _sample_mesh(asset, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
     rows, lines = scenes.select_object(points.positions, points.origin, cut.remove_plane, cut.nth, how.seed)
     points = points.take(rows)
@@ -222,8 +224,6 @@ def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
-        report(line)
     corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")

@@ -129,6 +129,9 @@ def test_the_colours_of_a_mesh_are_read_as_those_of_points(tmp_path, case):
     cloud, lines = read(write(tmp_path, *COLORED_MESHES[case]), num_points=50)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (50, 3)), atol=2e-3)
     assert any("taken as sRGB in 0.." in line for line in lines)
+    if case.startswith("OBJ, a"):
+        lines += read(write(tmp_path, "b.obj", COLORED_MESHES[case][1].replace(OBJ_FACE, "")))[1]
+        assert lines.count("1 of 5 vertices have no colour: the others' mean is taken") == 2
     assert ("ignored: 1 vertices of no face" in lines) == ("a vertex without" in case)
 
 
