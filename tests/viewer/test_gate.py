@@ -2,6 +2,8 @@
 
 import http.client
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -16,6 +18,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from spnr_jax.tools import commands, server  # noqa: E402
 
+TESTS = Path(__file__).parents[1]
 PROTOCOL = f"viser-v{viser.__version__}"
 
 
@@ -120,6 +123,13 @@ def test_another_host_asks_for_a_token_of_its_own_and_keeps_its_warning(running)
     everywhere.stop()
     assert running._server.request_share_url() is None, "no tunnel to a public address"
     assert running._server._share_tunnel is None
+
+
+@pytest.mark.ci  # a process of its own, which compiles
+def test_python_ends_well_while_programs_are_compiled_for_the_first_browser():
+    program = f"import sys; sys.path.insert(0, {str(TESTS)!r}); from support.tiny_viewer import viewer; viewer().stop()"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_a_viser_that_opens_its_server_another_way_is_not_left_open(monkeypatch):
