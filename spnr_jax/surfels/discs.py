@@ -45,7 +45,7 @@ def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " 
 def measure_layer_spacing(
     hood: Neighborhood, membership: Float[Array, "k block"], raw: Float[Array, " block"], const: Constants
 ) -> Float[Array, " block"]:
-    """Spacing from the area of the disc that holds 5.5 neighbors (by weight) on the same layer; in units of the box."""
+    """Spacing from the area of the disc that holds 3 neighbors (by weight) on the same layer; in units of the box."""
     others = len(membership) - 1
     summed = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
     wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * summed[-1], 0.5))

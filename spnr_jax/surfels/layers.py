@@ -49,7 +49,7 @@ class Constants:
     raw_neighbors: int = 6  # in the disc whose area gives the raw spacing
     least_spacing: float = 1e-5  # in units of the box, for points that coincide
     single_spacing: float = 0.1  # in units of the box, for a single point
-    disc_weight: float = 5.5  # summed weight of the neighbors in the disc whose area gives the spacing
+    disc_weight: float = 3.0  # summed weight of the neighbors in the disc whose area gives the spacing
     disc_share: float = 0.6  # upper bound of that weight: share of the layer's total weight
     spacing_bounds: Pair = (0.5, 1.6)  # of the ratio of the spacing to the raw spacing
     even_spacing_bound: float = 1.2  # upper bound of that ratio for even points: keeps thin legs thin
