@@ -48,7 +48,7 @@ EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candi
 # of the estimate that the network sees: even points with reflected ones (surfels/symmetry.py) have 0.53
 GRAPH = dataclasses.replace(CONSTANTS, even_distance=0.515)
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
-LEAST_PROBABILITY = 0.55  # probability above which a learned point is kept
+LEAST_PROBABILITY = 0.45  # probability above which a learned point is kept
 
 
 class Nodes(NamedTuple):
