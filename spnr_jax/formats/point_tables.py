@@ -163,6 +163,8 @@ def plain_names(table: np.ndarray, intensity_first: bool = False) -> tuple[str, 
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
     if 3 < count < 11 and len(table) > 2 and np.all(np.diff(table[:, 0]) == 1):
         return (INDEX, *plain_names(table[:, 1:], intensity_first))
+    if count and (known := np.isfinite(table).all(axis=1)).any():
+        table = table[known]
     first = NORMAL if count in (6, 9) and _are_normals(table[:, 3:6]) else COLOR
     more = {3: (), 4: ("intensity",), 6: first, 8: (*COLOR, "roughness", "metallic")}
     more[9] = (*first, *(NORMAL if first == COLOR else COLOR))
@@ -212,7 +214,7 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
     if rows.ndim == 3:  # the pixels of a camera that sees depth
         rows = rows.reshape(-1, rows.shape[2])
-    names = rows.dtype.names or plain_names(rows)
+    names = rows.dtype.names or plain_names(rows[:PIECE_LINES])
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])

@@ -85,6 +85,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
 BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+LABELED = [(*row, i % 40) for i, row in enumerate(ROWS)]
 PARAVIEW = [(*GREEN, *row[:3]) for row in ROWS]
 PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
@@ -102,7 +103,8 @@ TEXTS = {
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
     "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
     "a number before each point": ("a.csv", table(",", columns=INDEXED)),
-    "a label behind the colour": ("a.txt", table(" ", columns=[(*row, i % 40) for i, row in enumerate(ROWS)])),
+    "a label behind the colour": ("a.txt", table(" ", columns=LABELED)),
+    "a label, and a row of nan": ("a.txt", table(" ", columns=[*LABELED, 7 * (np.nan,)])),
     ".pts with an intensity like a colour": ("a.pts", table(" ", columns=[(*row[:3], 90, *GREEN) for row in ROWS])),
     "the last field not known": ("a.csv", "x,y,z,r,g,b,intensity\n" + table(",", ",")),
     "a line of units below the names": ("a.csv", "x,y,z,r,g,b\n[m],[m],[m],[],[],[]\n" + table(",")),
