@@ -184,9 +184,8 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     rotation = np.array(ROTATIONS[up], np.float64)
     if "normals" in values:
         values["normals"] = values["normals"] @ rotation.T
-    origin = np.zeros(3)
-    if _coarse(positions + before):
-        origin = np.floor(inner_box(positions + before)[0])
+    origin = _find_origin(positions + before)
+    if origin.any():
         how.report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
     cloud = _float32((positions + (before - origin)) @ rotation.T, values)
     return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=origin)
@@ -213,18 +212,18 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
     return PointCloud(positions=positions.astype(np.float32), mask=np.ones(len(positions), bool), **columns)
 
 
-def _coarse(positions: np.ndarray) -> bool:
-    """Whether float32 is too coarse for positions (n, 3) where they lie."""
+def _find_origin(positions: np.ndarray) -> np.ndarray:
+    """Whole numbers (3,) to subtract from positions (n, 3) where float32 is too coarse for them, else 0."""
     low, high = inner_box(positions)
     step = np.spacing(np.float32(np.maximum(np.abs(low), np.abs(high)).max()))
-    return bool(step > COARSEST_STEP * (high - low).max() > 0)
+    return np.floor(low) if step > COARSEST_STEP * (high - low).max() > 0 else np.zeros(3)
 
 
 def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     """Points spread evenly over a mesh, those inside the box that is to be cut out."""
     cut, report = how.cut, how.report
     count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    corners, origin = np.stack(bounding_box(asset)), np.zeros(3)
+    corners = np.stack(bounding_box(asset))
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     if kind not in TEXT_MESHES:
@@ -232,8 +231,7 @@ def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
         # they come as float64, also from files that have them shorter
         short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
         _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
-    if _coarse(corners):  # before anything of it becomes float32
-        origin = np.floor(corners[0])
+    if (origin := _find_origin(corners)).any():  # before anything of it becomes float32
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
     report(f"{count} points spread over the surface of the mesh")
@@ -293,7 +291,7 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     for axis, count, width in zip("xyz", counts, extent, strict=True):
         if 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
             report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
-    origin = np.floor(inner_box(positions)[0]) if _coarse(positions) else np.zeros(3)
+    origin = _find_origin(positions)
     values, directions = materials(columns, report), normals(columns)
     if directions is not None:
         values["normals"] = directions
