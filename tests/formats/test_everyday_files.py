@@ -248,8 +248,9 @@ def test_meshes_at_map_coordinates_keep_their_shape(tmp_path):
 
 def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
     far = np.array([[-4e6, 0, 0], [4e6, 0, 0], [0, 5e6, 0]])
-    np.save(tmp_path / "a.npy", np.concatenate([0.3 * BALL + UTM, far]))
-    for options in ({"cut": Cut(object="largest")}, {"clean": "auto"}):
+    scattered = np.random.default_rng(0).uniform(-4e6, 4e6, (100, 3))
+    for options, others in (({"cut": Cut(object="largest")}, scattered), ({"clean": "auto"}, far)):
+        np.save(tmp_path / "a.npy", np.concatenate([0.3 * BALL + UTM, others]))
         placed = place_cloud(tmp_path / "a.npy", up="y", **options)
         back = placed.cloud.positions + placed.origin
         np.testing.assert_allclose(back, 0.3 * BALL + UTM, rtol=0, atol=1e-6)
