@@ -220,17 +220,23 @@ class GraphConvolution(nn.Module):
         return self(hidden, self.send(hidden)[:, None], edges, real)
 
 
+MESSAGE = nn.Dense(WIDTH, use_bias=False)
+
+
 class Proposal(nn.Module):
     """Predicts points: a PointNet over the points around each candidate, in the candidate's frame."""
 
     @nn.compact
-    def __call__(self, nodes: Nodes, hidden: Float[Array, "n 64"], candidates: Candidates) -> LearnedPoints:
-        """Residuals on the middles of the candidates; without training, the middles themselves."""
+    def __call__(self, nodes: Nodes, sent: Float[Array, "n 64"], candidates: Candidates) -> LearnedPoints:
+        """Residuals on the middles of the candidates; without training, the middles themselves.
+
+        `sent` are the messages of the points to the candidates that they lie around.
+        """
         real = candidates.around >= 0
         point_features, offset = describe_points(nodes, candidates)
         pair_features = compare_ends(nodes, candidates)
         element = nn.Dense(WIDTH, name="element")(point_features) + nn.Dense(WIDTH, name="told")(pair_features)[:, None]
-        element += nn.Dense(WIDTH, use_bias=False, name="neighbor")(hidden)[candidates.around]
+        element += sent[candidates.around]
         element = nn.relu(nn.Dense(WIDTH, name="element1")(nn.relu(element)))
         pooled = nn.relu(nn.Dense(WIDTH, name="pool")(pool(element, real)))
         element = nn.Dense(WIDTH, name="element2")(element) + nn.Dense(WIDTH, name="back")(pooled)[:, None]
@@ -261,7 +267,10 @@ def init(key: Key, nodes: Nodes, candidates: Candidates) -> dict:
         params[f"graph{number}"] = GraphConvolution().init(keys[1 + number], hidden, edges, real, method="first")[
             "params"
         ]
-    return params | {"proposal": Proposal().init(keys[-1], nodes, hidden, candidates)["params"]}
+    keys = jax.random.split(keys[-1])
+    sent, neighbor = MESSAGE.init_with_output(keys[0], hidden)
+    proposal = Proposal().init(keys[1], nodes, sent, candidates)["params"]
+    return params | {"proposal": proposal | {"neighbor": neighbor["params"]}}
 
 
 def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], candidates: Candidates) -> LearnedPoints:
@@ -272,8 +281,10 @@ def predict(params: dict, nodes: Nodes, neighbors: Int[Array, "n 20"], candidate
     for number in range(CONVOLUTIONS):
         hidden = convolve(params[f"graph{number}"], hidden, edges, around, neighbors[:, 0] >= 0)
 
+    sent: Any = MESSAGE.apply({"params": params["proposal"]["neighbor"]}, hidden)  # once, not in each block
+
     def predict_block(block: Candidates) -> Any:
-        return Proposal().apply({"params": params["proposal"]}, nodes, hidden, block)
+        return Proposal().apply({"params": params["proposal"]}, nodes, sent, block)
 
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(predict_block, candidates))
     return map_existing(predict_block, candidates.exists, (candidates,), empty, BLOCK)
