@@ -84,6 +84,8 @@ def one_line(error: Exception) -> str:
     said = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.strerror:
         said = f"{error.filename or 'disk'}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        said = f"not enough memory ({said}); give fewer points, or ask for fewer pixels"
     line = " ".join(said.split())
     # a name or number in a broken file may be of any length
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE // 2]} ... {line[-LONGEST_LINE // 2 :]}"
@@ -141,7 +143,7 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         print(f"{name}: stopped, as what read the output was closed", file=sys.stderr)
         return 2
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         if debug:
             traceback.print_exc()
         print(f"{name}: {one_line(error)}", file=sys.stderr)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from spnr_jax import errors
@@ -37,6 +38,13 @@ def test_errors_of_many_lines_become_one():
     assert errors.one_line(ValueError("this\n  and\nthat")) == "this and that"
     assert errors.one_line(OSError(28, "No space left on device")) == "disk: No space left on device"
     assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
+
+
+def test_a_want_of_memory_is_one_line(capsys):
+    assert errors.guard(lambda: np.empty(2**46), "spnr") == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("spnr: not enough memory (Unable to allocate")
 
 
 ODD_NAME = """

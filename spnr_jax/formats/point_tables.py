@@ -9,7 +9,8 @@ tells, behind one that only counts, and for normals and colours their values:
     or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
     9 + r g b and nx ny nz in either order
 
-    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; they come whole where they are compressed
+    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; those without names are put side by side,
+            and told as columns of text are; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
@@ -49,6 +50,7 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
+UNNAMED = tuple(f"arr_{i}" for i in range(9))  # names by np.savez of arrays that were given none
 ARRAY_COLUMNS = {
     **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
@@ -204,7 +206,7 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            yield _name_columns(read_arrays(file, ARRAY_COLUMNS))
+            yield _name_columns(read_arrays(file, (*ARRAY_COLUMNS, *UNNAMED[1:])))
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
@@ -256,6 +258,9 @@ def _parsing() -> Iterator[None]:
 def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
+    if tables := [archive.pop(name) for name in UNNAMED if name in archive]:
+        with refusing("has arrays without names that do not fit side by side"):
+            archive[UNNAMED[0]] = np.column_stack(tables)
     for name, array in archive.items():
         targets, table = ARRAY_COLUMNS[name], array[:, None] if array.ndim == 1 else array
         if targets == COLOR and table.shape[1:] == (4,):

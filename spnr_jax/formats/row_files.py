@@ -49,8 +49,8 @@ LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, les
 def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool) -> Iterator[tuple[Columns, Lists]]:
     """Columns and lists of `count` rows from the file's place on, some at a time.
 
-    What has several numbers in every row is no column.  Rows whose lists are as long as those of the first are read at
-    once, others one by one.
+    Two to four numbers of one name are columns name:0, name:1 ..., as ParaView names them; more are none.  Rows whose
+    lists are as long as those of the first are read at once, others one by one.
     """
     lists, done = [name for name, _, width in properties if isinstance(width, str)], 0
     if not count or not properties:
@@ -79,9 +79,19 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
             yield _any_rows(file, wanted, properties, text, done)
         else:
             items = {name: rows[name].ravel() if lengths[name] else np.zeros(0) for name in lists}
-            columns = {name: rows[name] for name, _, width in properties if width == 1}
-            yield columns, {name: (found[name], items[name]) for name in lists}
+            yield _columns(properties, rows), {name: (found[name], items[name]) for name in lists}
         done += wanted
+
+
+def _columns(properties: Properties, rows: Any) -> Columns:
+    """The columns of rows, or of the values of properties by their names."""
+    columns: Columns = {}
+    for name, _, width in properties:
+        if width == 1:
+            columns[name] = rows[name]
+        elif width in (2, 3, 4):
+            columns |= {f"{name}:{i}": rows[name].reshape(-1, width)[:, i] for i in range(width)}
+    return columns
 
 
 def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, int]:
@@ -130,8 +140,7 @@ def _any_rows(
                 sizes[name].append(width)
             raw[name].append(take(kind, width))
     values = {name: join(raw[name], kind) for name, kind, _ in properties}
-    columns = {name: values[name] for name, _, width in properties if width == 1}
-    return columns, {name: (np.array(sizes[name], np.int64), values[name]) for name in sizes}
+    return _columns(properties, values), {name: (np.array(sizes[name], np.int64), values[name]) for name in sizes}
 
 
 def _lines(file: BufferedIOBase) -> Iterator[str]:
@@ -269,7 +278,7 @@ def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
 
 
 def pcd_pieces(path: Path) -> Iterator[Columns]:
-    """The fields of a PCD file as columns, some points at a time; a field of several numbers is left out."""
+    """The fields of a PCD file as columns, some points at a time."""
     with path.open("rb") as file:
         header = read_pcd_header(file)
         if header.encoding == "binary_compressed":

@@ -150,9 +150,22 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     x, y, z = BALL.T
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
-    for arrays in ({"arr_0": ROWS}, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
+    tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL}
+    parts = {f"arr_{i}": column for i, column in enumerate(np.array(ROWS).T)}
+    for arrays in ({"arr_0": ROWS}, tables, parts, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_a_field_of_three_numbers_is_a_colour_by_its_name(tmp_path, data):
+    head = "VERSION 0.7\nFIELDS x y z rgb fpfh\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 3 33\nPOINTS 420\n"
+    head += f"DATA {data}\n"
+    rows = np.zeros(420, [("xyz", "<f4", 3), ("rgb", "u1", 3), ("fpfh", "<f4", 33)])
+    rows["xyz"], rows["rgb"] = BALL, GREEN
+    plain = "\n".join(" ".join(str(number) for field in row for number in field) for row in rows)
+    cloud, _ = read(write(tmp_path, "a.pcd", head.encode() + (rows.tobytes() if data == "binary" else plain.encode())))
+    np.testing.assert_allclose(cloud.base_color[0], LINEAR, atol=1e-3)
 
 
 NORMALS = [(0.6, 0.8, 0.0), (0.0, -0.6, 0.8)]
@@ -275,6 +288,7 @@ PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
 LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
+UNLIKE = pack_arrays({"arr_0": np.zeros((5, 3)), "arr_1": np.zeros((4, 3))})
 KNOWN = "expected one of .ply .pcd .xyz .txt .csv .tsv .asc .pts .npz .npy .las .laz"
 REFUSED = [
     ("a.ply", None, "no such file"),
@@ -341,6 +355,7 @@ REFUSED = [
     ("a.npz", pack_arrays({"points": np.zeros((5, 5))}), r"numbers of shape \(5, 5\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
     ("a.npz", LENGTHS, "different lengths.*'x': 5.*'r': 4"),
+    ("a.npz", UNLIKE, "without names that do not fit side by side"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
     ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "truncated"),
     ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "Object arrays cannot be loaded"),
