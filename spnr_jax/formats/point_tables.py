@@ -9,8 +9,8 @@ tells, behind one that only counts, and for normals and colours their values:
     or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
     9 + r g b and nx ny nz in either order
 
-    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; those without names are put side by side,
-            and told as columns of text are; they come whole where they are compressed
+    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name, others
+            of 3 or 4 columns are told as text is; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
@@ -258,9 +258,11 @@ def _parsing() -> Iterator[None]:
 def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
-    if tables := [archive.pop(name) for name in UNNAMED if name in archive]:
-        with refusing("has arrays without names that do not fit side by side"):
-            archive[UNNAMED[0]] = np.column_stack(tables)
+    if unnamed := [archive.pop(name) for name in UNNAMED if name in archive]:
+        first, *others = unnamed
+        shapes = [(len(first), width) for width in (3, 4)] if first.ndim == 2 else []
+        beside = [array for array in others if array.shape in shapes and array.dtype.kind in NUMBERS]
+        archive[UNNAMED[0]] = np.concatenate([first, *beside], axis=1) if beside else first
     for name, array in archive.items():
         targets, table = ARRAY_COLUMNS[name], array[:, None] if array.ndim == 1 else array
         if targets == COLOR and table.shape[1:] == (4,):

@@ -150,9 +150,9 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     x, y, z = BALL.T
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
-    tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL}
-    parts = {f"arr_{i}": column for i, column in enumerate(np.array(ROWS).T)}
-    for arrays in ({"arr_0": ROWS}, tables, parts, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
+    ignored = {"arr_3": np.arange(420), "arr_4": np.zeros((420, 9))}
+    tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
+    for arrays in ({"arr_0": ROWS}, tables, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
@@ -288,7 +288,6 @@ PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
 LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
-UNLIKE = pack_arrays({"arr_0": np.zeros((5, 3)), "arr_1": np.zeros((4, 3))})
 KNOWN = "expected one of .ply .pcd .xyz .txt .csv .tsv .asc .pts .npz .npy .las .laz"
 REFUSED = [
     ("a.ply", None, "no such file"),
@@ -355,7 +354,6 @@ REFUSED = [
     ("a.npz", pack_arrays({"points": np.zeros((5, 5))}), r"numbers of shape \(5, 5\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
     ("a.npz", LENGTHS, "different lengths.*'x': 5.*'r': 4"),
-    ("a.npz", UNLIKE, "without names that do not fit side by side"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
     ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "truncated"),
     ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "Object arrays cannot be loaded"),
