@@ -9,8 +9,8 @@ tells, behind one that only counts, and for normals and colours their values:
     or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
     9 + r g b and nx ny nz in either order
 
-    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name, others
-            of 3 or 4 columns are told as text is; they come whole where they are compressed
+    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name,
+            those that look like colours or normals; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
@@ -260,8 +260,9 @@ def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
     columns: Columns = {}
     if unnamed := [archive.pop(name) for name in UNNAMED if name in archive]:
         first, *others = unnamed
-        shapes = [(len(first), width) for width in (3, 4)] if first.ndim == 2 else []
-        beside = [array for array in others if array.shape in shapes and array.dtype.kind in NUMBERS]
+        shapes = [(len(first), width) for width in (3, 4)] if first.ndim == 2 and len(first) else []
+        tables = [array for array in others if array.shape in shapes and array.dtype.kind in NUMBERS]
+        beside = [table for table in tables if _are_colors(table[:, :3]) or _are_normals(table[:, :3])]
         archive[UNNAMED[0]] = np.concatenate([first, *beside], axis=1) if beside else first
     for name, array in archive.items():
         targets, table = ARRAY_COLUMNS[name], array[:, None] if array.ndim == 1 else array

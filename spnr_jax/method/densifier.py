@@ -220,7 +220,7 @@ class GraphConvolution(nn.Module):
         return self(hidden, self.send(hidden)[:, None], edges, real)
 
 
-MESSAGE = nn.Dense(WIDTH, use_bias=False)
+MESSAGE = nn.Dense(WIDTH, use_bias=False)  # from a point to the candidates that it lies around
 
 
 class Proposal(nn.Module):

@@ -150,7 +150,7 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     x, y, z = BALL.T
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
-    ignored = {"arr_3": np.arange(420), "arr_4": np.zeros((420, 9))}
+    ignored = {"arr_3": np.arange(420), "arr_4": np.zeros((420, 9)), "arr_5": 3 * BALL}
     tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
     for arrays in ({"arr_0": ROWS}, tables, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
         np.savez(tmp_path / "c.npz", **arrays)
