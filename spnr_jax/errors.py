@@ -16,6 +16,7 @@ from typing import Any
 JSON = (dict, list, str, int, float, bool, type(None))
 LONGEST_LINE = 800  # characters of an error
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
+STARVED = "RESOURCE_EXHAUSTED"  # how XLA begins an error about memory
 STOPPED = 130  # exit code after Ctrl-C
 AGAIN = 0.1  # seconds after which a stop that was swallowed is tried again
 
@@ -84,7 +85,7 @@ def one_line(error: Exception) -> str:
     said = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.strerror:
         said = f"{error.filename or 'disk'}: {error.strerror}"
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or said.startswith(STARVED):
         said = f"not enough memory ({said}); give fewer points, or ask for fewer pixels"
     line = " ".join(said.split())
     # a name or number in a broken file may be of any length
@@ -143,7 +144,9 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         print(f"{name}: stopped, as what read the output was closed", file=sys.stderr)
         return 2
-    except (ValueError, OSError, MemoryError) as error:
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not str(error).startswith(STARVED):
+            raise
         if debug:
             traceback.print_exc()
         print(f"{name}: {one_line(error)}", file=sys.stderr)

@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -40,11 +42,19 @@ def test_errors_of_many_lines_become_one():
     assert errors.one_line(OSError(13, "Permission denied", "a/b")) == "a/b: Permission denied"
 
 
-def test_a_want_of_memory_is_one_line(capsys):
-    assert errors.guard(lambda: np.empty(2**46), "spnr") == 2
+@pytest.mark.parametrize(("module", "words"), [(np, "Unable to allocate"), (jnp, "RESOURCE_EXHAUSTED")])
+def test_a_want_of_memory_is_one_line(capsys, module, words):
+    assert errors.guard(lambda: module.ones(2**46), "spnr") == 2
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
-    assert said[0].startswith("spnr: not enough memory (Unable to allocate")
+    assert said[0].startswith(f"spnr: not enough memory ({words}")
+
+
+def test_another_error_of_a_library_keeps_its_call_stack():
+    removed = jnp.ones(2)
+    removed.delete()
+    with pytest.raises(RuntimeError, match="deleted"):
+        errors.guard(lambda: jax.block_until_ready(removed), "spnr")
 
 
 ODD_NAME = """

@@ -16,6 +16,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
+from spnr_jax.formats.point_tables import open_text
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
 
@@ -30,7 +31,8 @@ OPTION = re.compile(
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
     """The file's faces grouped by material, as they lie in the file."""
-    text = _parse(path.read_text("utf-8-sig", errors="replace"))
+    with open_text(path) as file:
+        text = _parse(file.read())
     if not (text["f sizes"] or text["v"]):
         raise UserError("has no faces, and no vertices")
     if text["surf"] and not text["f sizes"]:
@@ -163,7 +165,7 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     """Statements of an MTL file: material name -> keyword in lower case -> rest of the line."""
     library: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
-    for line in data.decode("utf-8-sig", errors="replace").splitlines():
+    for line in data.decode("utf-8-sig", "replace").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword.lower() == "newmtl":
             current = library.setdefault(rest.strip(), {})

@@ -11,6 +11,7 @@ has them so; what they mean is the affair of spnr_jax/formats/columns.py.
 import io
 import re
 import struct
+from codecs import BOM_UTF8
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import Columns
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
-from spnr_jax.formats.point_tables import numpy_pieces, text_pieces
+from spnr_jax.formats.point_tables import encoding_of, numpy_pieces, text_pieces
 from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_elements, read_ply_header
 
 TEXT = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts")
@@ -96,7 +97,8 @@ def kind_of(path: Path) -> str:
             head = file.read(4096)
         if not head and suffix in KNOWN:
             raise UserError(f"{path}: the file is empty")
-    if kind := _told_kind(MAGIC, head, suffix):
+    text = head.decode(encoding_of(head), "ignore").encode()
+    if kind := _told_kind(MAGIC, head.removeprefix(BOM_UTF8), suffix):
         return kind
     for sign, (name, version, convert) in FOREIGN.items():
         if sign == suffix if isinstance(sign, str) else head.startswith(sign):
@@ -104,7 +106,7 @@ def kind_of(path: Path) -> str:
             words = [value.decode("ascii", "replace") if isinstance(value, bytes) else str(value) for value in found]
             of_version = f" of version {'.'.join(words)}" if words else ""
             raise UserError(f"{path}: {name}{of_version}, which is not read: {convert}")
-    kind = _told_kind(TEXTS, head, suffix) or suffix
+    kind = _told_kind(TEXTS, text, suffix) or suffix
     if kind not in KNOWN:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected {known}")
     return kind

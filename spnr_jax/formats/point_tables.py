@@ -11,7 +11,8 @@ tells, behind one that only counts, and for normals and colours their values:
 
     .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name,
             those that look like colours or normals; they come whole where they are compressed
-    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
+    .npy    a structured array of named fields, or an array (points, columns) as in text, or (height, width, columns)
+            where those beside each other are close
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
 of text also in which line; its name is added by the caller.
@@ -25,7 +26,7 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -63,9 +64,7 @@ ARRAY_COLUMNS = {
 
 def text_pieces(path: Path) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; the last line before the numbers may name them."""
-    with path.open("rb") as file:
-        encoding = "utf-16" if file.read(2) in UTF_16 else "utf-8-sig"
-    with path.open(encoding=encoding, errors="replace") as file:
+    with open_text(path) as file:
         numbered = ((number, line.strip().replace('"', "")) for number, line in enumerate(file, 1))
         header, is_comment, first = _header(numbered)
         if not first[1]:
@@ -89,6 +88,18 @@ def text_pieces(path: Path) -> Iterator[Columns]:
             table = load_text(rows, "line", count, delimiter, ndmin=2)
             names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
+
+
+def open_text(path: Path) -> TextIO:
+    """A text file in UTF-8 or UTF-16."""
+    with path.open("rb") as file:
+        encoding = encoding_of(file.read(2))
+    return path.open(encoding=encoding, errors="replace")
+
+
+def encoding_of(head: bytes) -> str:
+    """The encoding of text that begins so."""
+    return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
 
 
 def _plain(text: str, delimiter: str | None, trailing: str) -> str:
@@ -214,14 +225,32 @@ def numpy_pieces(path: Path) -> Iterator[Columns]:
         rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    if rows.ndim == 3:  # the pixels of a camera that sees depth
+    if rows.ndim == 3 and rows.dtype.kind in NUMBERS:
+        if min(rows.shape[:2]) > 1:
+            _check_pixels(rows)
         rows = rows.reshape(-1, rows.shape[2])
+    elif rows.dtype.names:
+        rows = rows.reshape(-1)
     names = rows.dtype.names or plain_names(rows[:PIECE_LINES])
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
         named = zip(names, [piece[name] for name in names] if rows.dtype.names else piece.T, strict=True)
         yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
+
+
+def _check_pixels(rows: np.ndarray) -> None:
+    """ValueError unless rows (height, width, columns) are pixels of a depth camera: those beside each other are close.
+
+    They may be a batch of clouds, or a cloud that moves.
+    """
+    points = np.array(rows[: max(2, PIECE_LINES // max(1, rows.shape[1])), :, :3], np.float64)
+    mixed = points.reshape(-1, points.shape[2])[np.random.default_rng(0).permutation(points[..., 0].size)]
+    apart = [mixed - points.reshape(mixed.shape), *(np.diff(points, axis=axis) for axis in (0, 1))]
+    known = (lengths[np.isfinite(lengths)] for x in apart if len(lengths := np.linalg.norm(x, axis=-1)))
+    whole, *steps = (np.median(lengths) if lengths.size else 0.0 for lengths in known)
+    if max(steps) > whole / 2 > 0:
+        raise UserError(f"has the shape {rows.shape}, and is no depth image: save one cloud alone, as array[0]")
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:

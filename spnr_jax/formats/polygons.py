@@ -15,6 +15,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Loading, Part, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
+from spnr_jax.formats.point_tables import open_text
 from spnr_jax.formats.row_files import read_elements, read_ply_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
@@ -48,7 +49,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     data = path.read_bytes()
     announced = int.from_bytes(data[80:STL_HEAD], "little")
     whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # whatever the header says
-    if not whole and re.match(rb"\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
+    if not whole and re.match(rb"(\xef\xbb\xbf)?\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
         corners = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
         if len(corners) % 9:
             raise UserError(f"is cut off: {len(corners)} coordinates, where each triangle has 9")
@@ -69,7 +70,8 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
 
 def load_off(path: Path, loading: Loading) -> list[Part]:
     """The part of an OFF file."""
-    lines = re.sub(r"#.*", "", path.read_text("utf-8", "replace")).splitlines()
+    with open_text(path) as file:
+        lines = re.sub(r"#.*", "", file.read()).splitlines()
     text = "\n".join(line for line in lines if line.strip())
     if (head := OFF_HEAD.match(text)) is None:
         raise UserError("is not an OFF file that can be read: expected OFF, COFF, NOFF or CNOFF in text")

@@ -14,6 +14,7 @@ ValueError that says what is wrong; the file's name is added by the caller.
 import contextlib
 import math
 import re
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator
 from io import BufferedIOBase, BytesIO
 from itertools import chain, islice
@@ -169,7 +170,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     newline = re.search(rb"\r\n|\n|\r", data)
     # lines that end in \r alone may be followed by a byte of data that is a \n
     end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + newline[0], data) if newline else None
-    if not data.startswith(b"ply") or end is None:
+    if not data.removeprefix(BOM_UTF8).startswith(b"ply") or end is None:
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     order: str | None = None
     elements: list[tuple[str, int, Properties]] = []
@@ -246,7 +247,7 @@ def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
     if end is None:
         raise UserError("is not a PCD file, or its header is cut off (expected '# .PCD' ... 'DATA')")
     entries: dict[str, list[str]] = {}
-    for line in data[: end.end()].decode("ascii", "replace").splitlines():
+    for line in data[: end.end()].decode("utf-8-sig", "replace").splitlines():
         word, *values = line.split() or ["#"]
         if word not in ENTRIES and not word.startswith("#"):
             raise UserError(f"has a PCD header line that is not understood: {line.strip()!r}")

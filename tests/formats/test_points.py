@@ -5,6 +5,7 @@ import pickle
 import struct
 import time
 import zipfile
+from codecs import BOM_UTF8
 
 import numpy as np
 import pytest
@@ -131,6 +132,9 @@ TEXTS = {
     "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
     **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
     "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
+    "grey: UTF-16 OBJ": ("a.obj", POINT_LINES.encode("utf-16")),
+    "grey: OFF with a byte order mark": ("a.off", "\ufeffOFF\n420 0 0\n" + table(" ", columns=POINTS)),
+    "grey: PLY with a byte order mark": ("a.ply", BOM_UTF8 + ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
@@ -144,8 +148,11 @@ def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, c
 
 
 def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
-    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
-    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, BALL, atol=1e-6)
+    pixels = np.stack([*np.meshgrid(np.arange(20.0), np.arange(21.0)), np.zeros((21, 20))], axis=-1)
+    for picture in (pixels, np.concatenate([np.full((9, 20, 3), np.nan), pixels]), BALL[:, None]):
+        np.save(tmp_path / "a.npy", picture)
+        known = picture[~np.isnan(picture[..., 0])].reshape(-1, 3)
+        np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, known, atol=1e-6)
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     x, y, z = BALL.T
@@ -301,6 +308,7 @@ REFUSED = [
     ("points3D.bin", b"\1", "a binary file of one program, which is not read: of COLMAP, "),
     ("a.asc", "ncols 6\nnrows 2\n", "a grid of heights"),
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
+    ("a.npy", as_npy(BALL.reshape(4, 105, 3)), r"the shape \(4, 105, 3\), and is no depth image: save one cloud"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
     ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
