@@ -23,7 +23,19 @@ from scipy.spatial import cKDTree
 from spnr_jax.config import Cut
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Asset, ShownParts
-from spnr_jax.formats.columns import DEFAULTS, NORMAL, Columns, Report, keep_visible, materials, normals, sound, useful
+from spnr_jax.formats.columns import (
+    DEFAULTS,
+    NORMAL,
+    SHOWN_NAMES,
+    Columns,
+    Report,
+    keep_visible,
+    materials,
+    normals,
+    sound,
+    unused,
+    useful,
+)
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import bounding_box, sample_surface
@@ -52,7 +64,9 @@ TEXT_MESHES = (".obj", ".off")  # which write numbers of any length
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
-LOST_STEP = 1e-3  # of the extent, from which on what the file itself rounded is no shape any more
+LOST_STEP = 1e-3  # of the extent, from which on it is said that the file itself rounded positions
+MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
+FARTHEST = 1e30  # units; galaxies are 1e21 metres wide
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SAMPLE = 512  # points at which the file's normals are compared with the points
 FEWEST = 10  # points that tell something of a surface
@@ -142,7 +156,7 @@ class Points(NamedTuple):
 
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
-    pieces, noise, cut = column_pieces(path, kind), 0.0, how.cut
+    pieces, noise, cut = column_pieces(path, kind, how.report), 0.0, how.cut
     if pieces is None:
         from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
 
@@ -256,7 +270,9 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
 
     def sound_pieces() -> Iterator[Columns]:
         nonlocal broken, outside, low, high
-        for piece in pieces:
+        for number, piece in enumerate(pieces):
+            if others := [] if number else unused(piece):
+                report(f"columns that are not used: {', '.join(others[:SHOWN_NAMES])}")
             columns = useful(piece)
             wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))
@@ -313,13 +329,15 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
     farthest = np.maximum(np.abs(low), np.abs(high))
     short = [column.dtype if column.dtype.kind == "f" and column.dtype.itemsize <= 4 else None for column in columns]
     steps = np.array([np.spacing(kind.type(far)) if kind else 0.0 for kind, far in zip(short, farthest, strict=True)])
-    if steps.max() > LOST_STEP * extent.max() > 0:
+    if extent.max() > FARTHEST:
+        raise UserError(f"holds points {extent.max():.2g} apart: a broken file, or one of another byte order")
+    if steps.max() > MOST_LOST * extent.max() > 0:
         found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
     for axis, step, width, column in zip("xyz", steps, extent, positions.T, strict=True):
         if step > LOST_STEP * width > 0:
             report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
-    on_earth = (low[:2] >= [-180, -90]).all() and (high[:2] <= [180, 90]).all()
+    on_earth = farthest[:2].min() <= 90 and farthest[:2].max() <= 180
     if on_earth and 0 < max(x, y) < DEGREES and z > NEEDLE * max(x, y):
         size = f"{max(x, y):.2g} wide and {z:.3g} high"
         report(f"x and y look like degrees of longitude and latitude: {size}; project them to metres first")

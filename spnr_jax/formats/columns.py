@@ -16,6 +16,7 @@ writers put 8-bit or 12-bit colours into 16-bit fields, or 0 to 255 into floats,
 the rest black.
 """
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -33,8 +34,10 @@ SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coeffi
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
 ALIASES = (  # ours first, then what stands for it: the first group that is there counts
     (
-        *("x y z", "points:0 points:1 points:2", "points_0 points_1 points_2", "pos_x pos_y pos_z"),
-        *("easting northing elevation", "easting northing height"),
+        *("x y z", "points_0 points_1 points_2", "points_m_xyz_0 points_m_xyz_1 points_m_xyz_2", "pos_x pos_y pos_z"),
+        *("position_x position_y position_z", "location_x location_y location_z", "point_x point_y point_z"),
+        *("x_m y_m z_m", "x_coord y_coord z_coord", "px py pz", "easting northing elevation"),
+        *("easting northing height", "e n h", "x y height", "x y elevation"),
     ),
     (
         *("base_color_r base_color_g base_color_b", "base_color_red base_color_green base_color_blue"),
@@ -42,25 +45,25 @@ ALIASES = (  # ours first, then what stands for it: the first group that is ther
     ),
     (
         *("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "diffuse_r diffuse_g diffuse_b"),
-        *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue"),
-        *("rgb:0 rgb:1 rgb:2", "rgb_0 rgb_1 rgb_2", "colors:0 colors:1 colors:2", "colors_0 colors_1 colors_2"),
+        *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue", "colorr colorg colorb"),
+        *("rgb_0 rgb_1 rgb_2", "colors_0 colors_1 colors_2", "vertex_red vertex_green vertex_blue"),
     ),
-    (
-        *("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz"),
-        *("normals:0 normals:1 normals:2", "normals_0 normals_1 normals_2"),
-    ),
+    ("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz", "normals_0 normals_1 normals_2"),
     ("roughness", "rough", "roughness_factor", "pbr_roughness"),
     ("metallic", "metalness", "metallic_factor", "metal", "pbr_metallic"),
-    ("intensity", "reflectance", "reflectivity", "gray", "grey"),
+    ("intensity", "reflectance", "reflectivity", "amplitude", "gray", "grey"),
     ("alpha", "a", "diffuse_alpha", "color_a"),
     *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
 )
+OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
+SHOWN_NAMES = 6
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
 STRAYS, LEAST = 1000, 100  # one value of so many may leave the range, of so many at least
 DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of the colours that is worth a line
 BRIGHTEST = 0.99  # quantile of the intensities that is shown white; as many are black
+LEAST_GREY = 0.5 / 255
 SHORTEST = 1e-30  # normal that still has a direction
 FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog, and of other points
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
@@ -68,7 +71,7 @@ NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 def rename(columns: Columns) -> Columns:
     """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
-    plain = {name.strip().removeprefix(PREFIX): values for name, values in columns.items()} | columns
+    plain = {re.sub(r"[\s.:_-]+", "_", name.strip().removeprefix(PREFIX)): x for name, x in columns.items()} | columns
     found: Columns = {}
     for group in ALIASES:
         names = next((names.split() for names in group if set(names.split()) <= plain.keys()), [])
@@ -90,6 +93,12 @@ def useful(columns: Columns) -> Columns:
             f"found {' '.join(columns) or 'none'}"
         )
     return found
+
+
+def unused(columns: Columns) -> list[str]:
+    """Names of the columns of points that do not matter, but for those of splats."""
+    used = {id(values) for values in rename(columns).values()}
+    return [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
 
 
 def sound(columns: Columns) -> np.ndarray:
@@ -184,7 +193,8 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
         return None
     unknown = f", {int((~known).sum()):,} without one as 0.5" if not known.all() else ""
     report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey{unknown}")
-    grey = np.where(known, np.clip((intensity - dark) / (bright - dark), 0, 1), 0.5)
+    # never 0, which means that there is no colour
+    grey = np.where(known, np.clip((intensity - dark) / (bright - dark), LEAST_GREY, 1), 0.5)
     return srgb_to_linear(np.repeat(grey[:, None], 3, axis=-1))
 
 
@@ -216,7 +226,7 @@ def _unpack(packed: np.ndarray) -> np.ndarray:
     """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats that have their bits."""
     if packed.dtype == np.float64:  # which is wide enough for whole numbers, also with a sign
         packed = np.nan_to_num(packed)
-    whole = packed.itemsize == 8 and bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())
+    whole = bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())  # what has bits of colours is next to nothing
     if packed.dtype.kind != "f" or whole:
         bits = packed.astype(np.int64).astype(np.uint32)
     else:

@@ -373,9 +373,15 @@ def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement
 
 
 def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
-    """The material `index` of a file (None: glTF's default), None if it is nowhere seen, and where its textures lie."""
-    spec = {} if index is None else file.document["materials"][index]
-    name, extensions, loading = str(spec.get("name", f"number {index}")), spec.get("extensions", {}), file.loading
+    """The material `index` of a file, None if it is nowhere seen, and where its textures lie.
+
+    None is glTF's default, of a rough metal, where references are made; for a picture it is white and none.
+    """
+    loading, spec = file.loading, {} if index is None else file.document["materials"][index]
+    if index is None and not loading.strict:
+        spec = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.5}}
+        loading.say("parts without a material: roughness 0.5 and metallic 0 taken")
+    name, extensions = str(spec.get("name", f"number {index}")), spec.get("extensions", {})
     places: list[Placement] = []
     read = partial(_read_texture, file, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)

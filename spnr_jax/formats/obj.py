@@ -8,6 +8,7 @@ side, and a ray could not tell which it hits.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,10 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text["usemtl"]):
         looks[name] = make_material() if not name else _look(name, library.get(name), loading)
-        if colors is not None and name not in library:  # what has colours of its own is not multiplied with grey
-            looks[name] = make_material(1.0)
+        look = looks[name]
+        if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
+            loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
+            looks[name] = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
     parts = _parts(text, stack_columns(columns), colors, looks, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")

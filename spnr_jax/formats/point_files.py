@@ -1,7 +1,7 @@
 """Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-READERS says which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz .npy),
-las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
+TABLES and READERS say which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz
+.npy), las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
 may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
@@ -16,22 +16,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns
+from spnr_jax.formats.columns import Columns, Report
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.point_tables import encoding_of, numpy_pieces, text_pieces
 from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_elements, read_ply_header
 
 TEXT = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts")
+TABLES = {**dict.fromkeys(TEXT, text_pieces), **dict.fromkeys((".npz", ".npy"), numpy_pieces)}
 READERS = {
     **{".ply": lambda path: _ply(path), ".pcd": pcd_pieces},
-    **dict.fromkeys(TEXT, text_pieces),
-    **dict.fromkeys((".npz", ".npy"), numpy_pieces),
     **dict.fromkeys((".las", ".laz"), las_pieces),
     ".spz": lambda path: iter([spz_columns(path)]),
 }
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
-KNOWN = tuple(dict.fromkeys((*READERS, *MESHES)))
+KNOWN = (".ply", ".pcd", *TABLES, ".las", ".laz", ".spz", *MESHES)
 NUMBER, BLANK = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
 # how a file begins, and the kind that this tells: of several the one that its own suffix names, else the first
 MAGIC = (
@@ -45,12 +44,14 @@ MAGIC = (
 )
 TEXTS = (
     (rb"(?i)solid\b[^\0]*?\b(facet|endsolid)\b", (".stl",)),
-    (BLANK + rb"(ST)?C?N?4?n?OFF\b", (".off",)),
+    (BLANK + rb"(ST)?C?N?4?n?OFF(?=\d|\b)", (".off",)),
     (BLANK + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", (".obj",)),
     (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 COLMAP = "convert it to .ply with `colmap model_converter --output_type PLY`"
+ARRAYS = "save its points in Python with np.savez(file, points=..., colors=...)"
+PARAVIEW = "convert it to .ply, e.g. with ParaView (File > Save Data)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
 # first bytes or suffix -> what it is, where its version stands (as struct has it), how to convert it
 FOREIGN: dict[bytes | str, tuple] = {
@@ -70,8 +71,12 @@ FOREIGN: dict[bytes | str, tuple] = {
     ".bin": (
         "a binary file of one program",
         None,
-        f"of COLMAP, {COLMAP}; of CloudCompare, save it there as .las or .ply",
+        f"of COLMAP, {COLMAP}; of CloudCompare, save it there as .las or .ply; of KITTI, "
+        "np.save('a.npy', np.fromfile('a.bin', 'f4').reshape(-1, 4))",
     ),
+    **dict.fromkeys((".pt", ".pth", ".pkl", ".h5", ".hdf5", ".mat", ".parquet", ".xlsx"), ("data", None, ARRAYS)),
+    **dict.fromkeys((".vtk", ".vtp", ".vtu"), ("data of VTK", None, PARAVIEW)),
+    ".drc": ("a Draco file", None, "convert it to .ply with `draco_decoder -i a.drc -o a.ply`"),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
     **dict.fromkeys((".splat", ".ksplat", ".sog"), ("a file of splats", None, "convert it to .ply with SuperSplat")),
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz"), ("an archive", None, "unpack it first")),
@@ -89,14 +94,12 @@ def kind_of(path: Path) -> str:
         raise UserError(f"{path}: a folder; expected a file of {known}")
     if path.exists() and not path.is_file():
         raise UserError(f"{path}: a pipe or a device; save what comes from it as a file")
-    if not path.is_file() and (suffix in KNOWN or suffix in FOREIGN):
+    if not path.is_file():
         raise UserError(f"{path}: there is no such file")
-    head = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(4096)
-        if not head and suffix in KNOWN:
-            raise UserError(f"{path}: the file is empty")
+    with path.open("rb") as file:
+        head = file.read(4096)
+    if not head:
+        raise UserError(f"{path}: the file is empty")
     text = head.decode(encoding_of(head), "ignore").encode()
     if kind := _told_kind(MAGIC, head.removeprefix(BOM_UTF8), suffix):
         return kind
@@ -118,14 +121,13 @@ def _told_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suff
     return suffix if suffix in kinds else kinds[0]
 
 
-def column_pieces(path: Path, kind: str | None = None) -> Iterator[Columns] | None:
+def column_pieces(path: Path, kind: str, report: Report) -> Iterator[Columns] | None:
     """The columns of a file of points, some points at a time; None for a mesh; `kind` as kind_of says."""
-    kind = kind or kind_of(path)
     if kind == ".ply":
         with path.open("rb") as file:
             if read_ply_header(file).faces:
                 return None
-    return READERS[kind](path) if kind in READERS else None
+    return TABLES[kind](path, report) if kind in TABLES else READERS[kind](path) if kind in READERS else None
 
 
 def parse_ply(content: bytes) -> Columns:

@@ -11,8 +11,7 @@ tells, behind one that only counts, and for normals and colours their values:
 
     .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name,
             those that look like colours or normals; they come whole where they are compressed
-    .npy    a structured array of named fields, or an array (points, columns) as in text, or (height, width, columns)
-            where those beside each other are close
+    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
 of text also in which line; its name is added by the caller.
@@ -31,7 +30,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import NORMAL, POSITION, Columns
+from spnr_jax.formats.columns import NORMAL, POSITION, SHOWN_NAMES, Columns, Report
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
@@ -53,7 +52,9 @@ MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can ann
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
 UNNAMED = tuple(f"arr_{i}" for i in range(9))  # names by np.savez of arrays that were given none
 ARRAY_COLUMNS = {
-    **dict.fromkeys(("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coords", "arr_0"), POSITION),
+    **dict.fromkeys(
+        ("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coord", "coords", "arr_0"), POSITION
+    ),
     **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
     **dict.fromkeys(("colors", "rgb", "color"), COLOR),
     **{name: (name,) for name in (*POSITION, *COLOR, *NORMAL, "red", "green", "blue", "intensity", "roughness")},
@@ -62,11 +63,11 @@ ARRAY_COLUMNS = {
 }
 
 
-def text_pieces(path: Path) -> Iterator[Columns]:
+def text_pieces(path: Path, report: Report = lambda line: None) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; the last line before the numbers may name them."""
     with open_text(path) as file:
         numbered = ((number, line.strip().replace('"', "")) for number, line in enumerate(file, 1))
-        header, is_comment, first = _header(numbered)
+        header, is_comment, announced, first = _header(numbered)
         if not first[1]:
             raise UserError(f"holds 0 points: no row of numbers, only {header[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
@@ -83,11 +84,15 @@ def text_pieces(path: Path) -> Iterator[Columns]:
             if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := _plain(text, delimiter, trailing))
         )
         names: tuple[str, ...] = ()
+        found = 0
         while rows := list(islice(lines, PIECE_LINES)):
-            count = len(names) or len(rows[0][1].split(delimiter))
+            words = rows[0][1].split(delimiter)
+            count, found = len(names) or len(words), found + len(rows)
             table = load_text(rows, "line", count, delimiter, ndmin=2)
-            names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts")
+            names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts", report)
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
+        if announced > found:
+            report(f"the first line announces {announced:,} points, {found:,} are there: is the file cut off?")
 
 
 def open_text(path: Path) -> TextIO:
@@ -109,17 +114,29 @@ def _plain(text: str, delimiter: str | None, trailing: str) -> str:
     return text if delimiter == "," else text.replace(",", ".")
 
 
-def _header(lines: Iterator[Line]) -> tuple[str, bool, Line]:
-    """What stands before the numbers last, whether as a comment, and the first row of numbers (0, "" if none)."""
-    header, is_comment = "", True
+def _header(lines: Iterator[Line]) -> tuple[str, bool, int, Line]:
+    """What stands before the numbers: names or the last remark, whether as a comment, and a count of points.
+
+    Then the first row of numbers (0, "" if there is none).
+    """
+    header, is_comment, announced = "", True, 0
     for number, line in lines:
         text = re.sub(r"^(#|//|%)\s*", "", line)
-        if text and not NUMBER.fullmatch(re.split(r"[\s;,]+", text)[0]):
-            if re.search(r"\w", UNITS.sub("", text[:LONGEST_HEADER])):
+        words = re.split(r"[\s;,]+", text[:LONGEST_HEADER])
+        if text and not NUMBER.fullmatch(words[0]):
+            named = "x" in _split_names(header, r"[\s,;]+") and "x" not in map(str.lower, words)
+            if re.search(r"\w", UNITS.sub("", text[:LONGEST_HEADER])) and not (named and text == line):
                 header, is_comment = text[:LONGEST_HEADER], text != line
-        elif text and text == line and not text.isdecimal():
-            return header, is_comment, (number, line)
-    return header, is_comment, (0, "")
+        elif len(words) < 3 and words[0].isdecimal() and (text == line or not announced):  # and of columns
+            announced = max(announced, int(words[0]))
+        elif text and text == line and words != list(map(str, range(len(words)))):  # as pandas names an array's
+            return header, is_comment, announced, (number, line)
+    return header, is_comment, announced, (0, "")
+
+
+def _split_names(header: str, mark: str) -> list[str]:
+    """The names in a header, in small letters, without units."""
+    return [name.strip("\"' \t").lower() for name in re.split(mark, UNITS.sub("", header))]
 
 
 def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
@@ -148,12 +165,11 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 
-def _names(header: str, is_comment: bool, table: np.ndarray, intensity_first: bool) -> tuple[str, ...]:
+def _names(header: str, is_comment: bool, table: np.ndarray, intensity_first: bool, report: Report) -> tuple[str, ...]:
     """Names of the columns of a table from its header, or if that is a remark, from the numbers."""
     count, names = table.shape[1], [""]
-    plain = UNITS.sub("", header)
-    for mark in (*(mark for mark in ";," if mark in plain), r"[\s,;]+"):
-        names = [name.strip("\"' \t").lower() for name in re.split(mark, plain)]
+    for mark in (*(mark for mark in ";," if mark in UNITS.sub("", header)), r"[\s,;]+"):
+        names = _split_names(header, mark)
         while len(names) > count and not names[-1]:
             names.pop()
         if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
@@ -162,30 +178,35 @@ def _names(header: str, is_comment: bool, table: np.ndarray, intensity_first: bo
             break
     known, fits = "x" in names, len(names) == count
     if not (known and fits) and (is_comment or not (known or fits)):  # a remark
-        return plain_names(table, intensity_first)
+        return plain_names(table, report, intensity_first)
     if not fits:
         raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
     return tuple(INDEX if not name or name in names[:number] else name for number, name in enumerate(names))
 
 
-def plain_names(table: np.ndarray, intensity_first: bool = False) -> tuple[str, ...]:
+def plain_names(table: np.ndarray, report: Report, intensity_first: bool = False) -> tuple[str, ...]:
     """Names of the columns of a table (points, columns) that has none.
 
     `intensity_first` tells where both the first and the last three of four numbers could be a colour.
     """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
-    if 3 < count < 11 and len(table) > 2 and np.all(np.diff(table[:, 0]) == 1):
-        return (INDEX, *plain_names(table[:, 1:], intensity_first))
+    steps = np.diff(table[:, 0].astype(np.float64)) if 3 < count < 11 and len(table) > 2 else np.zeros(1)
+    # a number, or a time, which goes on about as fast
+    if np.all(steps == 1) or (count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2):
+        return (INDEX, *plain_names(table[:, 1:], report, intensity_first))
     if count and (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
-    first = NORMAL if count in (6, 9) and _are_normals(table[:, 3:6]) else COLOR
+    first = NORMAL if count in (6, 7, 9) and _are_normals(table[:, 3:6]) else COLOR
     more = {3: (), 4: ("intensity",), 6: first, 8: (*COLOR, "roughness", "metallic")}
     more[9] = (*first, *(NORMAL if first == COLOR else COLOR))
     if count == 7:
-        alpha_last = np.isin(table[:, 6], OPAQUE).all() or (table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1)
-        starts, ends = _are_colors(table[:, 3:6]), _are_colors(table[:, 4:])
-        color_first = starts and not (ends and intensity_first)
-        more[7] = (*COLOR, "alpha") if alpha_last else (*COLOR, "scalar") if color_first else ("intensity", *COLOR)
+        last, starts, ends = table[:, 6], _are_colors(table[:, 3:6]), _are_colors(table[:, 4:])
+        share = table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1 and np.median(last) == 1 and (last % 1).any()
+        color_first = first == NORMAL or (starts and not (ends and intensity_first))
+        more[7] = (*first, "scalar") if color_first else ("intensity", *COLOR)
+        more[7] = (*COLOR, "alpha") if share or (first == COLOR and np.isin(last, OPAQUE).all()) else more[7]
+    if count > 6 and count in more:
+        report(f"the {count} columns, which have no names, taken as {' '.join((*POSITION, *more[count]))}")
     if count not in more:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, "
@@ -211,46 +232,35 @@ def _are_colors(values: np.ndarray) -> bool:
 # --- NumPy ------------------------------------------------------------------------------------------------------------
 
 
-def numpy_pieces(path: Path) -> Iterator[Columns]:
+def numpy_pieces(path: Path, report: Report = lambda line: None) -> Iterator[Columns]:
     """The columns of an array, some points at a time, or of an archive."""
     with path.open("rb") as file:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            yield _name_columns(read_arrays(file, (*ARRAY_COLUMNS, *UNNAMED[1:])))
+            yield _name_columns(read_arrays(file, (*ARRAY_COLUMNS, *UNNAMED[1:]), report), report)
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
-    with refusing("is a broken, truncated or pickled NumPy file"), _parsing():
+    advice = "save arrays, as np.savez(file, points=..., colors=...)"
+    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), _parsing():
         rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
     if rows.ndim == 3 and rows.dtype.kind in NUMBERS:
         if min(rows.shape[:2]) > 1:
-            _check_pixels(rows)
+            report(
+                f"an array of {' x '.join(map(str, rows.shape))} taken as one cloud; of a batch, save array[0] alone"
+            )
         rows = rows.reshape(-1, rows.shape[2])
     elif rows.dtype.names:
         rows = rows.reshape(-1)
-    names = rows.dtype.names or plain_names(rows[:PIECE_LINES])
+    names = rows.dtype.names or plain_names(rows[:PIECE_LINES], report)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
         named = zip(names, [piece[name] for name in names] if rows.dtype.names else piece.T, strict=True)
         yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
-
-
-def _check_pixels(rows: np.ndarray) -> None:
-    """ValueError unless rows (height, width, columns) are pixels of a depth camera: those beside each other are close.
-
-    They may be a batch of clouds, or a cloud that moves.
-    """
-    points = np.array(rows[: max(2, PIECE_LINES // max(1, rows.shape[1])), :, :3], np.float64)
-    mixed = points.reshape(-1, points.shape[2])[np.random.default_rng(0).permutation(points[..., 0].size)]
-    apart = [mixed - points.reshape(mixed.shape), *(np.diff(points, axis=axis) for axis in (0, 1))]
-    known = (lengths[np.isfinite(lengths)] for x in apart if len(lengths := np.linalg.norm(x, axis=-1)))
-    whole, *steps = (np.median(lengths) if lengths.size else 0.0 for lengths in known)
-    if max(steps) > whole / 2 > 0:
-        raise UserError(f"has the shape {rows.shape}, and is no depth image: save one cloud alone, as array[0]")
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
@@ -260,8 +270,13 @@ def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> b
     return stream.getvalue()
 
 
-def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive, those that are wanted; ValueError if it is broken or unpacks to too much."""
+def read_arrays(
+    file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
+) -> dict[str, np.ndarray]:
+    """The arrays of an .npz archive, those that are wanted; ValueError if it is broken or unpacks to too much.
+
+    `report` gets a line about the others.
+    """
     with refusing("is a broken or truncated NumPy file"), _parsing(), np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or name in wanted]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
@@ -271,6 +286,8 @@ def read_arrays(file: io.BufferedIOBase, wanted: Collection[str] | None = None) 
             arrays = {name: np.asarray(archive[name]) for name in names}
         except MemoryError:  # a header can announce any number
             raise UserError("announces more than fits into the memory") from None
+    if others := [name for name in sizes if name not in names]:
+        report(f"arrays that are not used: {', '.join(others[:SHOWN_NAMES])}")
     if not arrays:
         raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(sizes) or 'none'}")
     return arrays
@@ -284,7 +301,7 @@ def _parsing() -> Iterator[None]:
         yield
 
 
-def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
+def _name_columns(archive: dict[str, np.ndarray], report: Report) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
     columns: Columns = {}
     if unnamed := [archive.pop(name) for name in UNNAMED if name in archive]:
@@ -298,7 +315,7 @@ def _name_columns(archive: dict[str, np.ndarray]) -> Columns:
         if targets == COLOR and table.shape[1:] == (4,):
             targets = (*COLOR, "alpha")
         if targets == POSITION and table.shape[1:] != (3,):
-            targets = plain_names(table)
+            targets = plain_names(table, report)
         if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
             raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
         columns |= dict(zip(targets, table.T, strict=True))

@@ -22,7 +22,7 @@ from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF\b(?!\s+BINARY)([^\S\n]*\n)?")
+OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?")
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
@@ -51,6 +51,8 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # whatever the header says
     if not whole and re.match(rb"(\xef\xbb\xbf)?\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
         corners = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
+        if not re.search(rb"(?i)\bendsolid\b", data):
+            loading.say("no line 'endsolid' ends the file: it may be cut off")
         if len(corners) % 9:
             raise UserError(f"is cut off: {len(corners)} coordinates, where each triangle has 9")
     else:
@@ -111,6 +113,8 @@ def _colored(
         loading.ignored.add(f"{loose:,} vertices of no face")
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
+    if {"roughness", "metallic"} & columns.keys():
+        loading.ignored.add("roughness and metallic of vertices")
     colors, notes = colors_of(columns) or (None, [])
     if colors is None and (found := colors_of(rename(of_faces))) is not None:
         positions, normals = positions[faces.ravel()], None

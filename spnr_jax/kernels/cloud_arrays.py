@@ -20,6 +20,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.records import PointCloud
 
 SMALLEST_BUCKET = 512
+VECTORS = ("positions", "base_color", "normals")  # fields of a cloud with three numbers a point
 
 
 def pad(cloud: PointCloud, size: int) -> PointCloud:
@@ -32,6 +33,19 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
         return np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
 
     return jax.tree.map(extend, cloud)
+
+
+def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:
+    """ValueError, which names the function and the field, for a field that does not fit the mask (points,)."""
+    shape, kind = np.shape(cloud.mask), np.result_type(cloud.mask)
+    if kind != np.bool_:
+        raise UserError(f"{where}: cloud.mask is of type {kind}, expected bool")
+    if len(shape) != 1 and not (batched and shape):
+        raise UserError(f"{where}: cloud.mask has the shape {shape}, expected (points,); use jax.vmap for more clouds")
+    for name, values in vars(cloud).items():
+        wanted = (*shape, 3) if name in VECTORS else shape
+        if values is not None and np.shape(values) != wanted:
+            raise UserError(f"{where}: cloud.{name} has the shape {np.shape(values)}, expected {wanted}")
 
 
 def strip(cloud: PointCloud) -> PointCloud:

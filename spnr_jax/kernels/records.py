@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
@@ -163,6 +164,8 @@ class Light:
 
     def __mul__(self, factor: float | int) -> "Light":
         """The light with its radiance multiplied by a factor."""
+        if isinstance(factor, Light):
+            return NotImplemented
         return Light(tables=factor * self.tables)
 
     __rmul__ = __mul__
@@ -180,6 +183,13 @@ class Light:
         places = xp.arange(self.tables.shape[-2]) - whole.astype(int)
         near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
+
+
+def check_light(light: Light | None) -> None:
+    """ValueError unless it is a light, or None."""
+    if light is not None and not isinstance(light, Light):
+        kind = type(light).__name__
+        raise UserError(f"light: expected a Light, as spnr_jax.read_light('studio') or light_of(map), got {kind}")
 
 
 @no_type_check

@@ -24,7 +24,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.surfels.geometry import estimate_surfels, normalise_cloud
+from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, normalise_cloud
 from spnr_jax.surfels.layers import CONSTANTS
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
@@ -410,6 +410,7 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
     """
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
+    check_inputs(cloud, neighbors, "densify")
     inside, centre, scale = normalise_cloud(cloud)
     dense = densify_in_box(params["densifier"], inside, neighbors)
     learned = dense.positions[len(cloud.mask) :] / scale + centre[None]

@@ -20,7 +20,16 @@ import numpy as np
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume, unstack
+from spnr_jax.kernels.records import (
+    Camera,
+    Light,
+    PointCloud,
+    Rendering,
+    SurfelScene,
+    Volume,
+    check_light,
+    unstack,
+)
 from spnr_jax.methods import method_of
 
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
@@ -44,6 +53,7 @@ class Model:
 
         Without `densify`, a sparse cloud gets no learned points: faster, but less sharp at rims and on curved parts.
         """
+        cloud_arrays.check_cloud(cloud, "encode")
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
@@ -89,6 +99,8 @@ class Model:
         """
         _check_quality(quality)
         lights = lights or [None] * len(views)
+        for light in lights:
+            check_light(light)
         draw = method_of(self.config).render
         return draw(self.variables, volume, views, lights, config=self.config, quality=quality)
 
@@ -103,7 +115,9 @@ class Model:
 
         Pure: angles and volume may be traced.
         """
-        size = resolution or self.config.image_resolution
+        size = self.config.image_resolution if resolution is None else resolution
+        if not size >= 1:
+            raise UserError(f"resolution must be at least 1 pixel, got {size}")
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
 
     @property

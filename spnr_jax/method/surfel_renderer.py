@@ -33,6 +33,7 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
+    check_light,
     unstack,
 )
 from spnr_jax.nn import shader
@@ -82,7 +83,10 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     Runs on the host, because array sizes cannot be traced.  The axes of a stack of scenes lead those of the cameras, or
     the cameras have none.  ValueError if a picture needs more entries than can be sorted.
     """
-    batch = np.shape(camera.cam_to_world)[:-2]
+    _check_scene(scene, "plan")
+    batch, tails = np.shape(camera.cam_to_world)[:-2], [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
+    if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
+        raise UserError(f"plan: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
     objects = np.shape(scene.spacing)
     if batch[: len(objects)] != objects:
         if batch:
@@ -202,6 +206,8 @@ def render(
 
 def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
     """ValueError in one line if there is not exactly one object, one view and one light."""
+    check_light(light)
+    _check_scene(scene, "render")
     for what, array, wanted in (
         ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
         ("camera.intrinsics", camera.intrinsics, (3, 3)),
@@ -213,6 +219,12 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
+
+
+def _check_scene(scene: SurfelScene, where: str) -> None:
+    """ValueError unless it is a scene."""
+    if not isinstance(scene, SurfelScene):
+        raise UserError(f"{where}: expected a scene of spnr_jax.encode, or volume.scene, got {type(scene).__name__}")
 
 
 class WindowBuffer(NamedTuple):

@@ -28,7 +28,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import triangles
+from spnr_jax.kernels.cloud_arrays import check_cloud
 from spnr_jax.kernels.numerics import (
     clamp,
     dot,
@@ -60,7 +62,10 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
     normals: the other side of a thin wall says nothing about how far apart the points of this side are.
     NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
     """
+    check_cloud(cloud, "neighbors", batched=True)
     positions, mask = np.asarray(cloud.positions), np.asarray(cloud.mask)
+    if not np.isfinite(positions[mask]).all():
+        raise UserError("neighbors: cloud.positions has NaN or infinity; remove those points")
     normals = None if cloud.normals is None else np.asarray(cloud.normals)
     found = np.full((*mask.shape, NEIGHBORS), -1, np.int32)
     for cloud_index in np.ndindex(mask.shape[:-1]):
@@ -429,8 +434,17 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     scene's centre.  The docstring of `geometry.py` lists what has no gradient.
     """
     del params
+    check_inputs(cloud, neighbors, "encode")
     inside, centre, scale = normalise_cloud(cloud)
     return make_scene(inside, neighbors, centre, scale, CONSTANTS)
+
+
+def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
+    """ValueError, which names the function and the argument, for shapes that do not fit each other."""
+    check_cloud(cloud, where)
+    if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
+        found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
+        raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
 
 
 def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:

@@ -33,7 +33,7 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     for name in ("roughness", "metallic"):
         np.testing.assert_array_equal(getattr(cloud, name), points[name])
     assert cloud.positions.dtype == cloud.base_color.dtype == cloud.roughness.dtype == np.float32
-    assert lines == []
+    assert lines == ["columns that are not used: face"]
 
 
 # Columns
@@ -57,6 +57,15 @@ def test_colours_have_many_names_and_are_srgb_unless_these_say_that_they_are_lin
     base_color, *_, lines = materials(tmp_path, **dict.fromkeys(names.split(), [0.5, 1.0, 0.0]))
     np.testing.assert_allclose(base_color, np.outer([NAMES[names], 1, 0], [1, 1, 1]), rtol=1e-5)
     assert ("red green blue taken as sRGB in 0..1" in lines) == (NAMES[names] == LEVEL)
+
+
+@pytest.mark.parametrize("kind", ["<u4", "<i4", "<f4", "<f8"])
+def test_packed_colours_are_whole_numbers_of_any_type_or_have_their_bits(tmp_path, kind):
+    packed = np.array([0x40AA3C, 0xFF0000, 0x0000FF])
+    for values in (packed.astype(kind), packed.astype("<u4").view("<f4"), (packed | 0xFF << 24).astype("<u4")):
+        base_color, *_ = materials(tmp_path, rgb=values)
+        np.testing.assert_array_equal(base_color[1:], [[1, 0, 0], [0, 0, 1]])
+        np.testing.assert_allclose(base_color[0], [0.0513, 0.4020, 0.0452], atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,28 @@ def test_unused_vertices_go_and_normals_become_unit(tmp_path):
     assert asset.ignored == ("some normals without a direction (the faces' are used)",)
 
 
+def test_a_grey_placeholder_does_not_darken_colours_of_vertices(tmp_path):
+    text = "".join(f"v {x} {y} 0 0 1 0\n" for x, y in ((0, 0), (1, 0), (0, 1))) + "usemtl paint\nf 1 2 3\n"
+    for color, expected in (("0.8 0.8 0.8", 1.0), ("0.5 0.25 0", np.float32([0.5, 0.25, 0]))):
+        asset = load_mesh(write_obj(tmp_path, text, f"newmtl paint\nKd {color}\nPr 0.25\n"))
+        np.testing.assert_array_equal(asset.parts[0].material.base_color, np.broadcast_to(expected, 3))
+        assert asset.parts[0].material.roughness == 0.25
+        assert ("MTL Kd beside colours of the vertices" in asset.ignored) == (np.ndim(expected) == 0)
+
+
+def test_what_is_missing_of_a_mesh_is_said(tmp_path):
+    corners = "".join("vertex {} {} 0\n".format(*pair) for pair in ((0, 0), (1, 0), (0, 1)))
+    for end, said in (("endsolid a\n", False), ("", True)):
+        (tmp_path / "a.stl").write_text(f"solid a\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n{end}")
+        assert (load_mesh(tmp_path / "a.stl").notes != ()) == said
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "roughness"))
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\nproperty list uchar int vertex_index\n"
+    )
+    (tmp_path / "a.ply").write_text(f"{head}end_header\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n")
+    assert "roughness and metallic of vertices" in load_mesh(tmp_path / "a.ply").ignored
+
+
 # Real files
 
 REAL = pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real mesh files is not beside this checkout")

@@ -16,7 +16,7 @@ from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_scan, compres
 
 from spnr_jax.formats import clouds, las, point_tables, row_files
 from spnr_jax.formats.clouds import place_cloud, read_cloud
-from spnr_jax.formats.point_files import column_pieces
+from spnr_jax.formats.point_files import column_pieces, kind_of
 from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.formats.row_files import decompress
 
@@ -48,7 +48,7 @@ def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatc
         monkeypatch.setattr(module, limit, size)
     monkeypatch.setattr(row_files, "PIECE_BYTES", 5 * 31)
     monkeypatch.setattr(las, "PIECE_BYTES", 5 * 36)
-    sizes = [len(next(iter(piece.values()))) for piece in column_pieces(path)]
+    sizes = [len(next(iter(piece.values()))) for piece in column_pieces(path, kind_of(path), print)]
     assert len(sizes) > 2
     assert sum(sizes) == 12
     np.testing.assert_array_equal(read(path)[0].positions, WHOLE.positions)
@@ -86,10 +86,13 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
 BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
+BINARY = [(*row[:3], *(x / 255 for x in GREEN), i % 2) for i, row in enumerate(ROWS)]
+TIMED = [(17.5 + i / 1e3 + (i % 3) / 1e4, *row) for i, row in enumerate(ROWS)]
 LABELED = [(*row, i % 40) for i, row in enumerate(ROWS)]
 PARAVIEW = [(*GREEN, *row[:3]) for row in ROWS]
 PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+BALL_AND_TWO = [(*point, 0, 0) for point in POINTS]
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
     "CRLF": ("a.csv", table(",", "\r")),
@@ -122,6 +125,14 @@ TEXTS = {
     "trailing semicolons": ("a.txt", table(";", ";")),
     "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
     "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
+    "an array's columns by number, as pandas writes them": ("a.csv", "0,1,2,3,4,5\n" + table(",")),
+    "counts of points and columns": ("a.xyz", "420 6\n" + table(" ")),
+    "units without brackets": ("a.csv", "x,y,z,r,g,b\nm,m,m,-,-,-\n" + table(",")),
+    "names of other programs": ("a.csv", "POINT_X,Point-Y,point.z,Color.R,color_g,Color B\n" + table(",")),
+    "a label of 0 and 1 behind colours of 0 to 1": ("a.txt", table(" ", columns=BINARY)),
+    "a time before each point": ("a.txt", table(" ", columns=TIMED)),
+    "grey: normals and a label": ("a.txt", table(" ", columns=[(*p, *p, i % 9) for i, p in enumerate(POINTS)])),
+    "grey: OFF and its counts in one word": ("a.off", "OFF420 0 0\n" + table(" ", columns=POINTS)),
     ".asc": ("a.asc", table(" ")),
     ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
     "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
@@ -148,11 +159,10 @@ def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, c
 
 
 def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
-    pixels = np.stack([*np.meshgrid(np.arange(20.0), np.arange(21.0)), np.zeros((21, 20))], axis=-1)
-    for picture in (pixels, np.concatenate([np.full((9, 20, 3), np.nan), pixels]), BALL[:, None]):
-        np.save(tmp_path / "a.npy", picture)
-        known = picture[~np.isnan(picture[..., 0])].reshape(-1, 3)
-        np.testing.assert_allclose(read_cloud(tmp_path / "a.npy").positions, known, atol=1e-6)
+    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
+    cloud, lines = read(tmp_path / "a.npy")
+    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-6)
+    assert lines[0].startswith("an array of 20 x 21 x 3 taken as one cloud; of a batch")
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     x, y, z = BALL.T
@@ -162,6 +172,19 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     for arrays in ({"arr_0": ROWS}, tables, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "line"),
+    [
+        ("a.pts", "999\n" + table(" "), "the first line announces 999 points, 420 are there: is the file cut off?"),
+        ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
+        ("a.csv", "x,y,z,depth,label\n" + table(",", columns=BALL_AND_TWO), "columns that are not used: depth, label"),
+        ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
+    ],
+)
+def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
+    assert line in read(write(tmp_path, name, data))[1]
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
@@ -251,6 +274,16 @@ def test_a_scan_without_colours_shows_its_intensity(tmp_path):
     assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
 
 
+def test_the_lowest_intensity_is_no_missing_colour(tmp_path):
+    lowest = np.random.default_rng(0).random(420) < 0.3
+    rows = [
+        (*point, 0 if low else 50 + i % 40) for i, (point, low) in enumerate(zip(BALL.tolist(), lowest, strict=True))
+    ]
+    cloud, lines = read(write(tmp_path, "a.xyz", table(" ", columns=rows)))
+    np.testing.assert_array_equal(cloud.base_color[:, 0] < 0.01, lowest)
+    assert not any("no colour (0 0 0)" in line for line in lines)
+
+
 @pytest.mark.parametrize(
     ("suffix", "place", "value", "reason"),
     [
@@ -308,7 +341,6 @@ REFUSED = [
     ("points3D.bin", b"\1", "a binary file of one program, which is not read: of COLMAP, "),
     ("a.asc", "ncols 6\nnrows 2\n", "a grid of heights"),
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
-    ("a.npy", as_npy(BALL.reshape(4, 105, 3)), r"the shape \(4, 105, 3\), and is no depth image: save one cloud"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
     ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
@@ -320,7 +352,7 @@ REFUSED = [
     ("a.ply", ply_bytes(LITTLE, rows=[]), "holds 0 points"),
     ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
     ("a.xyz", "0 0 1e39\n", "too large a number"),
-    ("a.csv", "px,py,pz\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found px py pz"),
+    ("a.csv", "u,v,w\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found u v w"),
     ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
     ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
     ("a.xyz", "0 0 0 3 4 66000\n", "from .* to 1.0"),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.point_files import column_pieces
+from spnr_jax.formats.point_files import column_pieces, kind_of
 from spnr_jax.formats.row_files import join_pieces
 from spnr_jax.surfels.sides import spiral
 
@@ -79,4 +79,4 @@ def read(path, **options):
 
 def read_columns(path) -> dict[str, np.ndarray]:
     """The columns of a whole file of points."""
-    return join_pieces(column_pieces(path))
+    return join_pieces(column_pieces(path, kind_of(path), print))

@@ -1,0 +1,54 @@
+"""Arguments that do not fit are named in one line, where no types are checked: as users have it, in another process."""
+
+import json
+import subprocess
+import sys
+
+CALLS = {
+    "neighbors(cloud.replace(positions=np.zeros((9, 2))))": "neighbors: cloud.positions has the shape (9, 2), expected",
+    "neighbors(cloud.replace(positions=np.full((9, 3), np.nan)))": "neighbors: cloud.positions has NaN or infinity",
+    "neighbors(cloud.replace(mask=np.ones(9)))": "neighbors: cloud.mask is of type float64, expected bool",
+    "encode(None, cloud.replace(roughness=np.zeros((9, 1))), near)": "encode: cloud.roughness has the shape (9, 1), e",
+    "encode(None, cloud.replace(base_color=np.zeros((8, 3))), near)": "encode: cloud.base_color has the shape (8, 3)",
+    "encode(None, jax.tree.map(lambda x: x[None], cloud), near)": "encode: cloud.mask has the shape (1, 9), expected",
+    "encode(None, cloud, near[:, :8])": "encode: neighbors has the shape (9, 8), expected (9, 20); they are",
+    "densify({'densifier': {}}, cloud, near[:8])": "densify: neighbors has the shape (8, 20), expected (9, 20)",
+    "plan(scene, camera.replace(cam_to_world=np.eye(4)))": "plan: expected a finite pose (3, 4) and intrinsics (3, 3)",
+    "plan(scene, camera.replace(intrinsics=np.full((3, 3), np.nan)))": "plan: expected a finite pose",
+    "plan(cloud, camera)": "plan: expected a scene of spnr_jax.encode, or volume.scene, got PointCloud",
+    "render(None, scene, camera, 'studio', plan=plan(scene, camera))": "light: expected a Light, as spnr_jax.read",
+    "render(None, cloud, camera, plan=None)": "render: expected a scene of spnr_jax.encode",
+    "model.encode(jax.tree.map(lambda x: x[None], cloud))": "encode: cloud.mask has the shape (1, 9)",
+    "model.render(None, camera, light='studio')": "light: expected a Light",
+    "model.camera(scene, resolution=0)": "resolution must be at least 1 pixel, got 0",
+    "light * light": "unsupported operand type",
+}
+SCRIPT = """
+import json, sys
+import jax, numpy as np
+import spnr_jax
+from spnr_jax import PointCloud, densify, encode, neighbors, plan, render
+
+rows = np.random.default_rng(0).random((4, 9, 3)).astype(np.float32)
+cloud = PointCloud(positions=rows[0], base_color=rows[1], roughness=rows[2, :, 0], metallic=rows[3, :, 0],
+                   mask=np.ones(9, bool))
+near, light, model = neighbors(cloud), spnr_jax.sun(40, 30), spnr_jax.load()
+scene = jax.jit(encode)(None, cloud, near)
+camera = model.camera(scene, resolution=16)
+said = []
+for call in json.loads(sys.argv[1]):
+    try:
+        eval(call)
+        said.append("nothing")
+    except (ValueError, TypeError) as error:
+        said.append(str(error))
+print(json.dumps(said))
+"""
+
+
+def test_arguments_that_do_not_fit_are_named_in_one_line():
+    done = subprocess.run([sys.executable, "-c", SCRIPT, json.dumps(list(CALLS))], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for (call, expected), said in zip(CALLS.items(), json.loads(done.stdout), strict=True):
+        assert said.startswith(expected), call
+        assert "\n" not in said
