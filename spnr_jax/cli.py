@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -22,7 +22,8 @@ from spnr_jax.devices import runtime
 from spnr_jax.errors import STOPPED, UserError, guard, one_line, require, split_debug, stop_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View
 
-BOX = r"[╭╮╰╯│─•]+|__tyro-dummy-inner__\."  # what tyro draws around an error, and its name for the whole command
+# what tyro draws around an error, its marks of bold letters, and its name for the whole command
+BOX = r"[╭╮╰╯│─•]+|\[/?bold\]|__tyro-dummy-inner__\."
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error.
 --methods FILE, a .py file or a module, adds methods and presets of your own to every command (docs/own_network.md)."""
@@ -63,7 +64,10 @@ def parse(arguments: list[str]) -> Command:
             )
     except SystemExit as stop:
         if stop.code:
-            raise UserError(re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])) from None  # without the title
+            said = re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])  # without the title
+            commands = {record.__name__.lower() for record in get_args(Command)}
+            command = next((f"{name} " for name in arguments[:1] if name in commands), "")
+            raise UserError(said.replace("spnr --help", f"spnr {command}--help")) from None
         raise
 
 

@@ -87,6 +87,8 @@ REFUSED = [  # command, what its line says
     (f"{UNLIT} --exposure 1 --sun 0 9", "--sun, --exposure: the network of --run RUN"),
     ("export ball.xyz --splats out.obj", "out.obj"),
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),
+    ("export ball.xyz", "a file; expected a run folder, or of a cloud `spnr export ball.xyz --splats"),
+    ("render ball.xyz --sun 40", "see spnr render --help"),
     ("export ball.xyz --light studio", "--splats"),
     ("export ball.xyz --up z", "--splats"),
     ("export nowhere.ply --splats out.ply", "nowhere.ply"),

@@ -72,6 +72,8 @@ def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
 def read_config(run: Path | str) -> TrainConfig:
     """The config of a run folder; ValueError if there is none or it is not of this version."""
     path = Path(run) / "config.json"
+    if Path(run).is_file():
+        raise UserError(f"{run}: a file; expected a run folder, or of a cloud `spnr export {run} --splats OUT.ply`")
     if not path.is_file():
         raise UserError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:
