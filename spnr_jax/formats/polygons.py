@@ -1,6 +1,7 @@
-"""PLY, STL and OFF files of triangles and polygons as parts: no materials, colours of vertices or faces at most.
+"""PLY, STL and OFF files of triangles and polygons as parts, with colours of vertices or faces, or a PLY's textures.
 
-.ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have
+.ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have; comments
+        `TextureFile name` with a list `texcoord` of each face, or s t or u v of the vertices (MeshLab, OpenMVS)
 .stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
         the file counts where the count is 0
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
@@ -13,14 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import Loading, Part, make_material
+from spnr_jax.formats.assets import SRGB_TABLE, Loading, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import open_text
-from spnr_jax.formats.row_files import read_elements, read_ply_header
+from spnr_jax.formats.row_files import Lists, read_elements, read_ply_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
-TEXCOORDS = ({"s", "t"}, {"u", "v"}, {"texture_u", "texture_v"})
+TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?")
 
@@ -39,9 +40,37 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     if element == "tristrips":
         corners = strip_faces(np.insert(corners.astype(np.int64), np.cumsum(sizes), -1)).ravel()
         sizes, of_faces = np.full(len(corners) // 3, 3), {}
-    if "texcoord" in lists or any(pair <= vertices.keys() for pair in TEXCOORDS):
-        loading.ignored.add("texture coordinates (of formats other than glTF and OBJ)")
+    texcoords = _texcoords(vertices, lists, corners, sizes)
+    images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
+    if texcoords is not None and images and all(image is not None for image in images):
+        return _textured(stack_columns(useful(vertices))[corners], sizes, texcoords, of_faces.get("texnumber"), images)
+    if texcoords is not None or "texcoord" in lists:
+        loading.ignored.add("texture coordinates")
     return _colored(vertices, corners, sizes, of_faces, loading)
+
+
+def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray | None:
+    """Texture coordinates (corners, 2) of a PLY file's faces or vertices, None without; v from the lower edge."""
+    known = [np.asarray(vertices[name]) for pair in TEXCOORDS if set(pair) <= vertices.keys() for name in pair]
+    of_faces, values = lists.get("texcoord", (np.zeros(0), np.zeros(0)))
+    if np.array_equal(of_faces, 2 * sizes):
+        return values.reshape(-1, 2)
+    inside = len(corners) and corners.min() >= 0 and corners.max() < len(vertices["x"])  # else the file is refused
+    return np.stack(known[:2], axis=-1)[corners] if known and inside else None
+
+
+def _textured(
+    positions: np.ndarray, sizes: np.ndarray, texcoords: np.ndarray, number: np.ndarray | None, images: list
+) -> list[Part]:
+    """A part for each image of polygons of so many corners at `positions` (corners, 3), numbered by their image."""
+    faces, owner = triangulate(positions, np.arange(len(positions)), sizes)
+    number = np.zeros(len(owner)) if number is None else number[owner]
+    texcoords = texcoords * [1, -1] + [0, 1]
+    parts = []
+    for i, image in enumerate(images):
+        material = make_material(decode_texels(image[..., :3], SRGB_TABLE))
+        parts.append(Part(positions=positions, faces=faces[number == i], material=material, texcoords=texcoords))
+    return parts
 
 
 def load_stl(path: Path, loading: Loading) -> list[Part]:

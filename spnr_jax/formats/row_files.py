@@ -157,6 +157,7 @@ class PlyHeader(NamedTuple):
 
     text: bool
     elements: list[tuple[str, int, Properties]]
+    textures: list[str]  # names of files, by MeshLab's comments
 
     @property
     def faces(self) -> str | None:
@@ -173,6 +174,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     if not data.removeprefix(BOM_UTF8).startswith(b"ply") or end is None:
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     order: str | None = None
+    textures: list[str] = []
     elements: list[tuple[str, int, Properties]] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
@@ -184,6 +186,8 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
                 elements[-1][2].append((name.lower(), TYPES[items], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
                 elements[-1][2].append((name.lower(), TYPES[kind], 1))
+            case ["comment", "TextureFile", *_]:
+                textures.append(line.split(None, 2)[-1].strip())
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -193,7 +197,7 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     file.seek(end.end())
     for _, _, own in elements:
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
-    return PlyHeader(order == "=", elements)
+    return PlyHeader(order == "=", elements, textures)
 
 
 def element_pieces(file: BufferedIOBase, header: PlyHeader, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
