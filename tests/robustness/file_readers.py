@@ -143,14 +143,38 @@ def tables(*suffixes: str) -> list[Files]:
     return found
 
 
+TEXTURED = b"""ply
+format ascii 1.0
+comment TextureFile a.png
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 2
+property list uchar int vertex_indices
+property list uchar float texcoord
+property int texnumber
+end_header
+0 0 0 0 0
+1 0 0 1 0
+1 1 0 1 1
+0 1 0 0 1
+3 0 1 2 6 0 0 1 0 1 1 0
+3 0 2 3 6 0 0 1 1 0 1 0
+"""
+
+
 def plain_meshes(suffix: str) -> list[Files]:
-    """A box as trimesh writes it."""
-    box = trimesh.creation.box()
+    """A box as trimesh writes it; of .ply also a textured square."""
+    box, found = trimesh.creation.box(), []
     if suffix == ".ply":
         box.visual.face_colors = np.tile([40, 170, 60, 255], (len(box.faces), 1))
+        found = [{"mesh.ply": TEXTURED, "a.png": png(TEXELS[..., :3])}]
     kinds = ("stl", "stl_ascii") if suffix == ".stl" else (suffix[1:],)
     contents = [box.export(file_type=kind) for kind in kinds]
-    return [{f"mesh{suffix}": data if isinstance(data, bytes) else data.encode()} for data in contents]
+    return [{f"mesh{suffix}": data if isinstance(data, bytes) else data.encode()} for data in contents] + found
 
 
 def objs() -> list[Files]:
