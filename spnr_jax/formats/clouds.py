@@ -26,10 +26,10 @@ from spnr_jax.formats.assets import Asset, ShownParts
 from spnr_jax.formats.columns import (
     DEFAULTS,
     NORMAL,
-    SHOWN_NAMES,
     Columns,
     Report,
     keep_visible,
+    list_names,
     materials,
     normals,
     sound,
@@ -272,7 +272,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
         nonlocal broken, outside, low, high
         for number, piece in enumerate(pieces):
             if others := [] if number else unused(piece):
-                report(f"columns that are not used: {', '.join(others[:SHOWN_NAMES])}")
+                report(f"columns that are not used: {list_names(others)}")
             columns = useful(piece)
             wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))

@@ -56,7 +56,7 @@ ALIASES = (  # ours first, then what stands for it: the first group that is ther
     *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
 )
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
-SHOWN_NAMES = 6
+SHOWN_NAMES, LONGEST_NAME = 6, 40
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
@@ -99,6 +99,11 @@ def unused(columns: Columns) -> list[str]:
     """Names of the columns of points that do not matter, but for those of splats."""
     used = {id(values) for values in rename(columns).values()}
     return [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
+
+
+def list_names(names: list[str]) -> str:
+    """The first names, of limited length, for a sentence."""
+    return ", ".join(name[:LONGEST_NAME] for name in names[:SHOWN_NAMES])
 
 
 def sound(columns: Columns) -> np.ndarray:

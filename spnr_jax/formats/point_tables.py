@@ -30,7 +30,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import NORMAL, POSITION, SHOWN_NAMES, Columns, Report
+from spnr_jax.formats.columns import NORMAL, POSITION, Columns, Report, list_names
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
@@ -127,7 +127,7 @@ def _header(lines: Iterator[Line]) -> tuple[str, bool, int, Line]:
             named = "x" in _split_names(header, r"[\s,;]+") and "x" not in map(str.lower, words)
             if re.search(r"\w", UNITS.sub("", text[:LONGEST_HEADER])) and not (named and text == line):
                 header, is_comment = text[:LONGEST_HEADER], text != line
-        elif len(words) < 3 and words[0].isdecimal() and (text == line or not announced):  # and of columns
+        elif words[0].isdecimal() and len(words) < (3 if text == line else 2):  # and perhaps of columns
             announced = max(announced, int(words[0]))
         elif text and text == line and words != list(map(str, range(len(words)))):  # as pandas names an array's
             return header, is_comment, announced, (number, line)
@@ -191,8 +191,9 @@ def plain_names(table: np.ndarray, report: Report, intensity_first: bool = False
     """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
     steps = np.diff(table[:, 0].astype(np.float64)) if 3 < count < 11 and len(table) > 2 else np.zeros(1)
-    # a number, or a time, which goes on about as fast
-    if np.all(steps == 1) or (count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2):
+    timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
+    if timed or np.all(steps == 1):
+        report("the first column, which grows steadily, taken as a number or a time of each point")
         return (INDEX, *plain_names(table[:, 1:], report, intensity_first))
     if count and (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
@@ -287,7 +288,7 @@ def read_arrays(
         except MemoryError:  # a header can announce any number
             raise UserError("announces more than fits into the memory") from None
     if others := [name for name in sizes if name not in names]:
-        report(f"arrays that are not used: {', '.join(others[:SHOWN_NAMES])}")
+        report(f"arrays that are not used: {list_names(others)}")
     if not arrays:
         raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(sizes) or 'none'}")
     return arrays

@@ -37,7 +37,7 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
 
 def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:
     """ValueError, which names the function and the field, for a field that does not fit the mask (points,)."""
-    shape, kind = np.shape(cloud.mask), np.result_type(cloud.mask)
+    shape, kind = np.shape(cloud.mask), getattr(cloud.mask, "dtype", None) or np.asarray(cloud.mask).dtype
     if kind != np.bool_:
         raise UserError(f"{where}: cloud.mask is of type {kind}, expected bool")
     if len(shape) != 1 and not (batched and shape):

@@ -171,7 +171,7 @@ def test_of_a_browsers_file_name_only_its_last_part_is_shown(name, shown):
     ("name", "content", "words"),
     [
         ("a.ply", b"", "a.ply: the file is empty"), ("a.exe", b"MZ", "a.exe: unknown kind"),
-        ("ply", b"", "ply: unknown"),
+        ("ply", b"", "ply: the file is empty"),
         ("../evil/.ply", b"x", "unknown kind"), ("n.xyz", b"0 0 nan\n", "n.xyz"), ("p.npz", b"\x80\x04N.", "p.npz"),
         ("../b.exr", b"#?RADIANCE\n", "b.exr: not a readable"),
     ],
