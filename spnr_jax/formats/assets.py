@@ -30,7 +30,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import Columns, srgb_to_linear
+from spnr_jax.formats.columns import LONGEST_NAME, Columns, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
@@ -40,7 +40,7 @@ TransparentParts = Literal["refuse", ShownParts]  # what becomes of parts that l
 CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0, "opacity": 0, "normal_map": 1}  # axes of one value
 BARELY_VISIBLE = 0.1  # alpha below it, as a share of the texture's largest, is empty space around what is drawn
 MOSTLY_OPAQUE = 0.5
-MOST_NAMES, LONGEST_NAME = 3, 40  # in a sentence
+MOST_NAMES = 3  # in a sentence
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits

@@ -36,7 +36,7 @@ from spnr_jax.formats.columns import (
     unused,
     useful,
 )
-from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of
+from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import bounding_box, sample_surface
 from spnr_jax.kernels import scenes
@@ -66,7 +66,6 @@ WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
 LOST_STEP = 1e-3  # of the extent, from which on it is said that the file itself rounded positions
 MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
-FARTHEST = 1e30  # units; galaxies are 1e21 metres wide
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SAMPLE = 512  # points at which the file's normals are compared with the points
 FEWEST = 10  # points that tell something of a surface

@@ -56,7 +56,7 @@ ALIASES = (  # ours first, then what stands for it: the first group that is ther
     *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
 )
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
-SHOWN_NAMES, LONGEST_NAME = 6, 40
+SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones

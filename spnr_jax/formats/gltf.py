@@ -24,7 +24,7 @@ from trimesh.transformations import quaternion_matrix
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels, make_material
-from spnr_jax.formats.columns import LINEAR, NORMAL, Columns
+from spnr_jax.formats.columns import LINEAR, LONGEST_NAME, NORMAL, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -402,7 +402,7 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     shown = loading.cut_out(name, material, *_alpha(spec, color, (*factor, 1.0)[3]))
     if UNLIT in extensions:
         light = "colours that hold light already (KHR_materials_unlit) taken as base colours"
-        loading.say(light, about=repr(name[: assets.LONGEST_NAME]))
+        loading.say(light, about=repr(name[:LONGEST_NAME]))
     loading.ignored |= extensions.keys() - {SPECULAR_GLOSSINESS} | (spec.keys() & {"occlusionTexture"})
     loading.ignored |= {"emissive"} if any(spec.get("emissiveFactor", ())) else set()
     if loading.strict:

@@ -37,7 +37,7 @@ AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to 
 MOST = 0.7  # share of the points that must be seen from a place that a file names; of few points of a ball 0.61 are
 OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
 BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
-FARTHEST = 1e30  # a place beyond it is none
+FARTHEST = 1e30  # units, beyond which no sensor and no point lies: galaxies are 1e21 metres wide
 PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 

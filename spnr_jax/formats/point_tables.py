@@ -63,7 +63,7 @@ ARRAY_COLUMNS = {
 }
 
 
-def text_pieces(path: Path, report: Report = lambda line: None) -> Iterator[Columns]:
+def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; the last line before the numbers may name them."""
     with open_text(path) as file:
         numbered = ((number, line.strip().replace('"', "")) for number, line in enumerate(file, 1))
@@ -233,7 +233,7 @@ def _are_colors(values: np.ndarray) -> bool:
 # --- NumPy ------------------------------------------------------------------------------------------------------------
 
 
-def numpy_pieces(path: Path, report: Report = lambda line: None) -> Iterator[Columns]:
+def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of an array, some points at a time, or of an archive."""
     with path.open("rb") as file:
         magic = file.read(6)
