@@ -67,6 +67,8 @@ COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
 LOST_STEP = 1e-3  # of the extent, from which on it is said that the file itself rounded positions
 MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
+SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis, at which six digits leave a hundred values at most
+NO_DATA = -9999  # height of a grid's place without one
 SAMPLE = 512  # points at which the file's normals are compared with the points
 FEWEST = 10  # points that tell something of a surface
 LEAST_POINTS = 100  # that tell normals, and what has no colour
@@ -239,8 +241,10 @@ def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
     corners = np.stack(bounding_box(asset))
     if np.abs(corners).max() > np.finfo(np.float32).max:
         raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+    vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
+    # walls and floors have few values by themselves, so only where six digits are too few
+    _check_rounding(vertices, np.abs(corners).max(axis=0) > SIX_DIGITS * np.ptp(corners, axis=0), report)
     if kind not in TEXT_MESHES:
-        vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
         # they come as float64, also from files that have them shorter
         short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
         _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
@@ -300,12 +304,10 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
 def _interpret(columns: Columns, how: Reading) -> Points:
     """What the columns of a file of points mean, equal and nearly equal points as one."""
     columns, report = keep_visible(columns, how.cut.keep_noise, how.report), how.report
+    columns = _without_no_data(columns, report)
     positions = stack_columns(columns)
     _check_steps(positions, [columns[axis] for axis in "xyz"], report)
-    counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
-    for axis, count, width in zip("xyz", counts, extent, strict=True):
-        if 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
-            report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
+    _check_rounding(positions, np.ones(3, bool), report)
     origin = _find_origin(positions)
     values, directions = materials(columns, report), normals(columns)
     if directions is not None:
@@ -319,6 +321,26 @@ def _interpret(columns: Columns, how: Reading) -> Points:
     if len(places) < FEWEST:
         report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)
+
+
+def _without_no_data(columns: Columns, report: Report) -> Columns:
+    """The points of a grid of heights without those whose height says that there is none."""
+    known = columns["z"] != NO_DATA
+    heights = columns["z"][known]
+    if not 0 < len(heights) < len(known) or heights.min() - NO_DATA < np.ptp(heights):
+        return columns
+    report(f"{len(known) - len(heights):,} points left out: their height is {NO_DATA}, no data")
+    return {name: column[known] for name, column in columns.items()}
+
+
+def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> None:
+    """A line for each of some axes (3,) that has far fewer values than another, far apart."""
+    if not axes.any():
+        return
+    counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
+    for axis, count, width, looked_at in zip("xyz", counts, extent, axes, strict=True):
+        if looked_at and 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
+            report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
 
 
 def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:

@@ -1,6 +1,6 @@
 """Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
 
-TABLES and READERS say which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz
+READERS says which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz
 .npy), las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
@@ -20,17 +20,24 @@ from spnr_jax.formats.columns import Columns, Report
 from spnr_jax.formats.gaussian_files import decompress_columns, spz_columns
 from spnr_jax.formats.las import las_pieces
 from spnr_jax.formats.point_tables import encoding_of, numpy_pieces, text_pieces
-from spnr_jax.formats.row_files import element_pieces, pcd_pieces, read_elements, read_ply_header
+from spnr_jax.formats.row_files import (
+    element_pieces,
+    pcd_pieces,
+    read_elements,
+    read_ply_header,
+    report_further_rows,
+)
 
 TEXT = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts")
-TABLES = {**dict.fromkeys(TEXT, text_pieces), **dict.fromkeys((".npz", ".npy"), numpy_pieces)}
 READERS = {
-    **{".ply": lambda path: _ply(path), ".pcd": pcd_pieces},
-    **dict.fromkeys((".las", ".laz"), las_pieces),
-    ".spz": lambda path: iter([spz_columns(path)]),
+    **{".ply": lambda path, report: _ply(path, report), ".pcd": pcd_pieces},
+    **dict.fromkeys(TEXT, text_pieces),
+    **dict.fromkeys((".npz", ".npy"), numpy_pieces),
+    **dict.fromkeys((".las", ".laz"), lambda path, _: las_pieces(path)),
+    ".spz": lambda path, _: iter([spz_columns(path)]),
 }
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
-KNOWN = (".ply", ".pcd", *TABLES, ".las", ".laz", ".spz", *MESHES)
+KNOWN = (*READERS, *MESHES)
 NUMBER, BLANK = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
 # how a file begins, and the kind that this tells: of several the one that its own suffix names, else the first
 MAGIC = (
@@ -74,7 +81,8 @@ FOREIGN: dict[bytes | str, tuple] = {
         f"of COLMAP, {COLMAP}; of CloudCompare, save it there as .las or .ply; of KITTI, "
         "np.save('a.npy', np.fromfile('a.bin', 'f4').reshape(-1, 4))",
     ),
-    **dict.fromkeys((".pt", ".pth", ".pkl", ".h5", ".hdf5", ".mat", ".parquet", ".xlsx"), ("data", None, ARRAYS)),
+    **dict.fromkeys((".pt", ".pth", ".pkl", ".h5", ".hdf5", ".mat", ".parquet"), ("data", None, ARRAYS)),
+    ".xlsx": ("a spreadsheet", None, "save it as .csv"),
     **dict.fromkeys((".vtk", ".vtp", ".vtu"), ("data of VTK", None, PARAVIEW)),
     ".drc": ("a Draco file", None, "convert it to .ply with `draco_decoder -i a.drc -o a.ply`"),
     **dict.fromkeys((".fbx", ".dae", ".3ds", ".3mf", ".blend", ".x3d", ".wrl"), ("a scene", None, BLENDER)),
@@ -127,7 +135,7 @@ def column_pieces(path: Path, kind: str, report: Report) -> Iterator[Columns] | 
         with path.open("rb") as file:
             if read_ply_header(file).faces:
                 return None
-    return TABLES[kind](path, report) if kind in TABLES else READERS[kind](path) if kind in READERS else None
+    return READERS[kind](path, report) if kind in READERS else None
 
 
 def parse_ply(content: bytes) -> Columns:
@@ -136,7 +144,7 @@ def parse_ply(content: bytes) -> Columns:
     return read_elements(file, read_ply_header(file), "vertex")["vertex"][0]
 
 
-def _ply(path: Path) -> Iterator[Columns]:
+def _ply(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a .ply file, unpacked where it is one of compressed splats."""
     with path.open("rb") as file:
         header = read_ply_header(file)
@@ -146,3 +154,6 @@ def _ply(path: Path) -> Iterator[Columns]:
             yield decompress_columns(chunks, packed)
         else:
             yield from (columns for _, columns, _ in element_pieces(file, header, "vertex"))
+            name, count, properties = header.elements[-1]
+            if name == "vertex":
+                report_further_rows(file, count, properties, header.text, report)

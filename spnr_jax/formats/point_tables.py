@@ -78,11 +78,16 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         if delimiter and first[1].endswith(delimiter):
             of_header = header.rstrip(delimiter).count(delimiter)
             trailing = delimiter if of_header != first[1].count(delimiter) else ""
-        lines = (
-            (number, plain)
-            for number, text in chain([first], numbered)
-            if not text.startswith(COMMENTS) and not text.isdecimal() and (plain := _plain(text, delimiter, trailing))
-        )
+
+        def rows_of_numbers() -> Iterator[Line]:
+            nonlocal announced
+            for number, text in chain([first], numbered):
+                if text.isdecimal():
+                    announced += int(text[:SHOWN])
+                elif not text.startswith(COMMENTS) and (plain := _plain(text, delimiter, trailing)):
+                    yield number, plain
+
+        lines = rows_of_numbers()
         names: tuple[str, ...] = ()
         found = 0
         while rows := list(islice(lines, PIECE_LINES)):
@@ -91,8 +96,9 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             table = load_text(rows, "line", count, delimiter, ndmin=2)
             names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts", report)
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
-        if announced > found:
-            report(f"the first line announces {announced:,} points, {found:,} are there: is the file cut off?")
+        if announced and announced != found:
+            end = ": is the file cut off?" if announced > found else ""
+            report(f"a line of the file announces {announced:,} points, {found:,} are there{end}")
 
 
 def open_text(path: Path) -> TextIO:

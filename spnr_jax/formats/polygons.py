@@ -92,6 +92,9 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
         if not announced:
             loading.say(f"the header announces 0 triangles, {held} stand behind it: these are drawn")
+        elif held > announced:
+            more = held - announced
+            loading.say(f"the header announces {announced} triangles, {more} more stand behind them and are not read")
         rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
         corners = rows["corners"]
         loading.ignored |= {"STL attribute bytes"} if rows["attribute"].any() else set()

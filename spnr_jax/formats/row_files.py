@@ -16,7 +16,7 @@ import math
 import re
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator
-from io import BufferedIOBase, BytesIO
+from io import SEEK_END, BufferedIOBase, BytesIO
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns
+from spnr_jax.formats.columns import Columns, Report
 from spnr_jax.formats.point_tables import load_text
 
 Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
@@ -82,6 +82,17 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
             items = {name: rows[name].ravel() if lengths[name] else np.zeros(0) for name in lists}
             yield _columns(properties, rows), {name: (found[name], items[name]) for name in lists}
         done += wanted
+
+
+def report_further_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool, report: Report) -> None:
+    """A line about rows from the file's place on, behind the `count` that its header announces."""
+    held, begin = 0, file.tell()
+    if text:
+        held = sum(1 for _ in _lines(file))
+    elif not any(isinstance(width, str) for *_, width in properties):
+        held = (file.seek(0, SEEK_END) - begin) // max(1, _layout(properties, {})[0].itemsize)
+    if held:
+        report(f"the header announces {count:,} points, {held:,} more stand behind them and are not read")
 
 
 def _columns(properties: Properties, rows: Any) -> Columns:
@@ -282,15 +293,16 @@ def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
     return PcdHeader([field for field in properties if field[2]], num_points, encoding, organised, sensor)
 
 
-def pcd_pieces(path: Path) -> Iterator[Columns]:
+def pcd_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The fields of a PCD file as columns, some points at a time."""
     with path.open("rb") as file:
         header = read_pcd_header(file)
         if header.encoding == "binary_compressed":
             yield _packed_columns(file.read(), header)
         else:
-            rows = read_rows(file, header.num_points, header.properties, header.encoding == "ascii")
-            yield from (columns for columns, _ in rows)
+            announced = header.num_points, header.properties, header.encoding == "ascii"
+            yield from (columns for columns, _ in read_rows(file, *announced))
+            report_further_rows(file, *announced, report)
 
 
 def _packed_columns(body: bytes, header: PcdHeader) -> Columns:

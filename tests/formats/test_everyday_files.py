@@ -303,6 +303,39 @@ def test_a_mesh_of_short_floats_far_away_is_refused(tmp_path):
         read(write(tmp_path, "a.stl", stl(2, at=UTM)))
 
 
+def test_a_mesh_far_away_whose_file_has_six_digits_is_said_to_be_rounded(tmp_path):
+    ball, faces = BALL * 10 + UTM, "".join(f"f {i} {i + 1} {i + 2}\n" for i in range(1, 419))
+    for digits, rounded in (("g", True), (".3f", False)):
+        vertices = "".join("v " + " ".join(f"{x:{digits}}" for x in point) + "\n" for point in ball)
+        _, lines = read(write(tmp_path, "a.obj", vertices + faces), num_points=50)
+        assert any(re.match(r"only 3 distinct values along y, 4\d\d along", line) for line in lines) == rounded
+
+
+def test_places_of_a_grid_without_a_height_are_left_out_and_heights_that_reach_so_low_are_not(tmp_path):
+    fifth = np.where(np.arange(420) % 5 == 0, -9999, BALL[:, 2])
+    low = np.append(-9999, 2e4 * BALL[1:, 2])
+    for size, z, left in ((1, fifth, 336), (2e4, low, 420)):
+        np.save(tmp_path / "a.npy", np.column_stack([size * BALL[:, :2], z]))
+        cloud, lines = read(tmp_path / "a.npy")
+        assert len(cloud.positions) == left
+        assert ("84 points left out: their height is -9999, no data" in lines) == (left == 336)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_rows_behind_those_that_a_header_announces_are_said(tmp_path, text):
+    rows = np.column_stack([SQUARE, [0, 1, 2, 3]]).astype("<f4")
+    names, body = "xyzi", "\n".join(" ".join(map(str, row)) for row in rows).encode() if text else rows.tobytes()
+    ply = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex COUNT\n"
+    ply += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    pcd = f"VERSION .7\nFIELDS {' '.join(names)}\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS COUNT\n"
+    pcd += f"DATA {'ascii' if text else 'binary'}\n"
+    for name, head in (("a.ply", ply), ("a.pcd", pcd)):
+        for count in (3, 4):
+            _, lines = read(write(tmp_path, name, head.replace("COUNT", str(count)).encode() + body + b"\n"))
+            said = "the header announces 3 points, 1 more stand behind them and are not read" in lines
+            assert said == (count == 3)
+
+
 def test_normals_of_a_mesh_that_lie_across_its_faces_are_left_out(tmp_path):
     for normals, kept in (([0, 0, -1], True), ([1, 0, 0], False)):
         names = ("nx", "ny", "nz")
@@ -370,6 +403,8 @@ def test_a_binary_stl_with_a_tail_or_without_a_count_is_read_by_its_size(tmp_pat
         cloud, lines = read(write(tmp_path, "a.stl", content), num_points=200)
         np.testing.assert_allclose(np.ptp(cloud.positions, axis=0), [1, 1, 0], atol=0.03)
     assert "the header announces 0 triangles, 2 stand behind it: these are drawn" in lines
+    _, lines = read(write(tmp_path, "a.stl", stl(1)), num_points=9)
+    assert "the header announces 1 triangles, 1 more stand behind them and are not read" in lines
     with pytest.raises(ValueError, match="announces 3 triangles, 2 are there"):
         read(write(tmp_path, "a.stl", stl(3)))
 

@@ -177,7 +177,8 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
 @pytest.mark.parametrize(
     ("name", "data", "line"),
     [
-        ("a.pts", "999\n" + table(" "), "the first line announces 999 points, 420 are there: is the file cut off?"),
+        ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
+        ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
         ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
         ("a.csv", "x,y,z,depth,label\n" + table(",", columns=BALL_AND_TWO), "columns that are not used: depth, label"),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
