@@ -38,7 +38,7 @@ READERS = {
 }
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 KNOWN = (*READERS, *MESHES)
-NUMBER, BLANK = rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
+NUMBER, BLANK = rb"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
 # how a file begins, and the kind that this tells: of several the one that its own suffix names, else the first
 MAGIC = (
     (rb"ply", (".ply",)),

@@ -188,6 +188,11 @@ def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
     assert line in read(write(tmp_path, name, data))[1]
 
 
+def test_the_kind_of_a_file_of_thousands_of_digits_is_told_in_no_time(tmp_path):
+    with pytest.raises(ValueError, match="expected 3 numbers|one place"):  # not after hours of splitting them
+        read(write(tmp_path, "a.xyz", "1.5 2 " + 4000 * "9" + "\n1 2 x\n"))
+
+
 @pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_a_field_of_three_numbers_is_a_colour_by_its_name(tmp_path, data):
     head = "VERSION 0.7\nFIELDS x y z rgb fpfh\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 3 33\nPOINTS 420\n"
