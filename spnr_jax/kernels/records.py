@@ -35,6 +35,8 @@ class PointCloud:
     """1 where roughness and metallic are known, else 0; None: known everywhere."""
     learned: Float[AnyArray, "*batch points"] | None = None
     """0 for a measured point; 1 - p / 2 for a learned one, where p is the probability that it lies on the surface."""
+    evenness: Float[AnyArray, "*batch points"] | None = None
+    """How evenly the measured points lie (`surfels.geometry.measure_evenness`); None: as evenly as these points."""
 
 
 @no_type_check

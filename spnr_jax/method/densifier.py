@@ -24,8 +24,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, normalise_cloud
-from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, measure_evenness, normalise_cloud
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
 SPARSE = 8192  # points of a cloud up to which points are added everywhere; larger ones: rims, curves, thin walls
@@ -45,8 +44,6 @@ LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther
 ROUNDS = 8  # of the selection
 FEATURES, CONVOLUTIONS = 64, 3  # features of points; number of graph convolutions
 EDGE, WIDTH, HEAD = 9, 64, 128  # features of an edge, of a point around a candidate, and of a candidate
-# of the estimate that the network sees: even points with reflected ones (surfels/symmetry.py) have 0.53
-GRAPH = dataclasses.replace(CONSTANTS, even_distance=0.515)
 BLOCK = 256  # points or candidates in a block: a block fits into a core's cache
 LEAST_PROBABILITY = 0.45  # probability above which a learned point is kept
 
@@ -89,7 +86,7 @@ class LearnedPoints(NamedTuple):
 
 def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Candidates]:
     """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
-    nodes = describe_nodes(estimate_surfels(cloud, neighbors, GRAPH))
+    nodes = describe_nodes(estimate_surfels(cloud, neighbors))
     return nodes, place_candidates(nodes, neighbors)
 
 
@@ -421,6 +418,7 @@ def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "po
     """`densify` of a cloud in the box."""
     neighbors = jnp.asarray(neighbors)
     nodes, candidates = build_graph(cloud, neighbors)
+    evenness = measure_evenness(cloud, neighbors)
     learned = predict(params, nodes, neighbors, candidates)
 
     def extend(column: AnyArray, more: Array | None = None) -> Array:
@@ -437,4 +435,5 @@ def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "po
         normals=extend(nodes.normal, learned.normal),
         materials_known=None if cloud.materials_known is None else extend(cloud.materials_known),
         learned=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(learned.logit) / 2),
+        evenness=jnp.full((1 + CANDIDATES) * len(nodes.spacing), evenness),
     )

@@ -79,14 +79,6 @@ def average_rows(
     return jax.lax.scan(add, empty, (neighbors, weight / sum_first(weight)[None]))[0]
 
 
-def measure_evenness(
-    hood: Neighborhood, membership: Float[Array, "k block"], spacing: Float[Array, " block"]
-) -> Float[Array, " block"]:
-    """Spacings to the nearest other point of the layer; median 0.5 for random points, 0.7 to 0.8 for even ones."""
-    squared = jnp.min(jnp.where(membership[1:] > 0.5, hood.squared[1:], jnp.inf), axis=0)
-    return jnp.sqrt(squared) / spacing
-
-
 def find_farthest(uv: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
     """Distance of the farthest point of the plane in each of 16 directions."""
     turn = jnp.asarray(RIM_ANGLES[: NUM_RIM_DIRECTIONS // 2], uv.dtype)

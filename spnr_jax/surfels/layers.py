@@ -51,8 +51,7 @@ class Constants:
     single_spacing: float = 0.1  # in units of the box, for a single point
     disc_weight: float = 3.0  # summed weight of the neighbors in the disc whose area gives the spacing
     disc_share: float = 0.6  # upper bound of that weight: share of the layer's total weight
-    spacing_bounds: Pair = (0.5, 1.6)  # of the ratio of the spacing to the raw spacing
-    even_spacing_bound: float = 1.2  # upper bound of that ratio for even points: keeps thin legs thin
+    spacing_bounds: Pair = (0.5, 1.2)  # of the ratio of the spacing to the raw spacing; the upper keeps thin legs thin
     averaged_neighbors: int = 9  # neighbors over which spacing and visibility are averaged
     distance_sigma: float = 1.2  # standard deviation of the weight of a neighbor's distance
 
@@ -99,11 +98,11 @@ class Constants:
     edge_sine: float = 0.3  # sine between normals above which a plane cuts a disc
     cut_margin: float = 0.1  # by which a disc extends beyond the line where another face cuts it
     cut_cosine: float = 0.8  # least cosine between the direction to such a line and one of a disc's four directions
-    rim_margin: float = 0.25  # by which a surface extends beyond the last point of its layer
+    rim_margin: float = 0.25  # by which a surface extends beyond the last point of its layer, whatever gaps are covered
     largest_radius: float = 4.0  # radius of a disc without an end
 
     # gaps between random points
-    even_distance: float = 0.62  # median distance to the nearest point above which points are even: gaps are holes
+    even: float = 0.64  # evenness from which points are even: gaps are holes
     widest_gap: float = 2.2  # radius of the largest gap that is bridged
     duplicate_distance: float = 5e-7  # half the squared distance below which two points coincide
     gap_cover: float = 0.95  # distance to the middle of a gap, in spacings as enlarged, at most

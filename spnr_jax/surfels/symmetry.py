@@ -21,11 +21,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral
 
 FEWEST_POINTS = 128  # of a cloud that is completed
-EVEN = 0.7  # mean distance to the nearest other point from which points are even (0.8; random ones 0.55)
 MOST_PLANES, ORTHOGONAL = 2, 0.3  # planes used, and the largest cosine between their normals
 CANDIDATES, REFINED, DISTINCT = 320, 3, 0.98  # directions of normals, planes refined, cosine from which two are one
 SCORING, REGISTERING = 256, 1024  # points that score a candidate, and that register a plane
@@ -97,13 +97,16 @@ class Plane(NamedTuple):
 def complete(cloud: PointCloud) -> PointCloud:
     """The cloud (unbatched, without padding), then its points reflected in up to two planes of symmetry.
 
-    The same cloud if it has too few or too many points, or no symmetry.  Reflected points keep their material; where
-    the surface has another color there are none, because a pattern need not be symmetric.
+    Only the points of the cloud if there are too few or too many, or no symmetry.  Reflected points keep their
+    material; where the surface has another color there are none, because a pattern need not be symmetric.  `evenness`
+    is that of the measured points: others between them hide it.
     """
     count = len(cloud.mask)
     if not FEWEST_POINTS <= count <= RANDOM.most_points:
         return cloud
-    limits = choose_limits(cloud)
+    evenness = measure_evenness(cloud)
+    cloud = dataclasses.replace(cloud, evenness=np.full(count, evenness, np.float32))
+    limits = choose_limits(evenness)
     if count > limits.most_points:
         return cloud
     surface = measure_surface(cloud, limits)
@@ -116,10 +119,16 @@ def complete(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
-def choose_limits(cloud: PointCloud) -> Limits:
-    """The limits for the points of a cloud, by their distances to the nearest other point."""
-    distance, _, spacing = measure_distances(cKDTree(cloud.positions))
-    return RANDOM if distance[:, 1].mean() < EVEN * spacing else EVENLY_SPREAD
+def measure_evenness(cloud: PointCloud) -> float:
+    """`geometry.measure_evenness` on the host."""
+    distance = measure_distances(cKDTree(cloud.positions))[0][:, 1:7]
+    mean = distance.mean(axis=1)
+    return float(np.median(distance[:, 0] / np.where(mean > 0, mean, 1)))
+
+
+def choose_limits(evenness: float) -> Limits:
+    """The limits for points that lie so evenly."""
+    return RANDOM if evenness < CONSTANTS.even else EVENLY_SPREAD
 
 
 def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:

@@ -47,16 +47,13 @@ def test_normals_point_outward_within_degrees_and_the_spacing_is_the_root_of_the
     assert np.mean((ratio > 0.75) & (ratio < 1.25)) > (0.98 if spread == "even" else 0.75)  # wider beside gaps
 
 
-def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbors_where_points_are_even():
+def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbors():
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(0, 2 * np.pi, 8000), rng.uniform(-0.9, 0.9, 8000)
     dense = np.stack([0.03 * np.cos(angle), height, 0.03 * np.sin(angle)], axis=1)
-    medians = []
-    for positions in (dense[farthest_points(dense, 200, 0)], dense[:200]):
-        by_all = np.sqrt(np.pi / 6) * cKDTree(positions).query(positions, 7)[0][:, 6]
-        medians.append(np.median(estimate(positions)["spacing"] / by_all))
-    assert 1.1 < medians[0] < 1.2  # 1.43 by the neighbors of a layer alone
-    assert medians[1] > 1.17  # random points are not held: 1.23, and 1.12 if they were
+    positions = dense[farthest_points(dense, 200, 0)]
+    by_all = np.sqrt(np.pi / 6) * cKDTree(positions).query(positions, 7)[0][:, 6]
+    assert 1.1 < np.median(estimate(positions)["spacing"] / by_all) < 1.2  # 1.43 by the neighbors of a layer alone
 
 
 def test_the_shape_is_0_in_a_plane_and_on_a_line():

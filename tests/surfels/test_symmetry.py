@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from spnr_jax.kernels.cloud_arrays import farthest_points
-from spnr_jax.surfels import symmetry
+from spnr_jax.kernels.cloud_arrays import farthest_points, pad
+from spnr_jax.surfels import geometry, symmetry
+from tests.support.laws import close
 from tests.support.surfel_clouds import cloud
 
 DEEP = 0.35  # half the depth of the seat
@@ -46,11 +48,28 @@ def sparse(points, count=1000, spread="even", **columns):
 
 
 def surface_of(one) -> symmetry.Surface:
-    return symmetry.measure_surface(one, symmetry.choose_limits(one))
+    return symmetry.measure_surface(one, symmetry.choose_limits(symmetry.measure_evenness(one)))
+
+
+def evenness_of(one) -> float:
+    return float(geometry.measure_evenness(one, jnp.asarray(geometry.neighbors(one))))
 
 
 def spacing_of(one) -> float:
     return surface_of(one).spacing
+
+
+@pytest.mark.parametrize(("spread", "expected"), [("even", 0.77), ("random", 0.53)])
+def test_the_evenness_is_that_of_the_program_in_any_units_and_kept_beside_added_points(spread, expected):
+    one, _ = sparse(chair()[0], spread=spread)
+    found = symmetry.measure_evenness(one)
+    assert abs(found - expected) < 0.05
+    for scale in (1e-4, 1.0, 1e4):
+        close(evenness_of(pad(dataclasses.replace(one, positions=scale * one.positions), 1024)), found, rtol=1e-4)
+    more = symmetry.complete(one)
+    assert len(more.mask) > len(one.mask)
+    close(evenness_of(more), found)
+    assert abs(evenness_of(dataclasses.replace(more, evenness=None)) - found) > 0.03
 
 
 @pytest.mark.parametrize(("count", "off"), [(1000, 0.05), (300, 0.15)])
@@ -140,7 +159,7 @@ def test_a_cloud_without_symmetry_stays_as_it_is(spread):
         for _ in range(5)
     ]
     one, _ = sparse(rng.permutation(np.concatenate(parts)), spread=spread)
-    assert symmetry.complete(one) is one
+    assert len(symmetry.complete(one).mask) == len(one.mask)
 
 
 def test_a_plate_is_not_reflected_in_its_middle():
@@ -149,7 +168,7 @@ def test_a_plate_is_not_reflected_in_its_middle():
     inside = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside) * [1.5, 0.7]  # a scalene triangle
     one = cloud(np.concatenate([inside, rng.choice([-0.005, 0.005], (1000, 1))], axis=1) - [0.5, 0.25, 0])
     assert 0.5 * spacing_of(one) > 0.01
-    assert symmetry.complete(one) is one
+    assert len(symmetry.complete(one).mask) == len(one.mask)
 
 
 def test_reflected_points_fill_the_gaps_of_random_ones():
@@ -186,7 +205,7 @@ def test_spaced_points_leave_no_room_for_others():
 )
 def test_very_few_and_many_points_stay_as_they_are(count, spread, stays):
     one, _ = sparse(np.random.default_rng(0).permutation(chair()[0]), count, spread)
-    assert (symmetry.complete(one) is one) == stays
+    assert (len(symmetry.complete(one).mask) == count) == stays
 
 
 @pytest.mark.parametrize("case", ["line", "plane", "place", "no normals", "helix"])
