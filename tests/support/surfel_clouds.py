@@ -52,12 +52,15 @@ def cloud(positions, **columns) -> PointCloud:
 _estimate = jax.jit(estimate_surfels)
 
 
-def estimate(positions, base_color=None, roughness=None, metallic=None, normals=None, order=None) -> Surfels:
+def estimate(
+    positions, base_color=None, roughness=None, metallic=None, normals=None, order=None, evenness=None
+) -> Surfels:
     """Surfels of points in the box, in their order, as NumPy arrays; computed padded, by few programs.
 
     `order` are the places of the points among the padding.
     """
     given = {"base_color": base_color, "roughness": roughness, "metallic": metallic, "normals": normals}
+    given["evenness"] = evenness
     points = cloud(positions, **{name: values for name, values in given.items() if values is not None})
     points = pad(points, next(size for size in PADDED if size >= len(positions)))
     places = np.arange(len(positions)) if order is None else np.asarray(order)

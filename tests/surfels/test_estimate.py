@@ -56,6 +56,16 @@ def test_the_spacing_on_a_thin_leg_is_at_most_a_fifth_above_that_by_all_neighbor
     assert 1.1 < np.median(estimate(positions)["spacing"] / by_all) < 1.2  # 1.43 by the neighbors of a layer alone
 
 
+@pytest.mark.parametrize(("evenness", "low", "high"), [(None, 0.95, 1.1), (0.5, 1.3, 1.6)])
+def test_discs_are_enlarged_beside_a_gap_if_the_points_were_random_and_leave_a_hole_if_even(evenness, low, high):
+    positions, _, spacing = shape("plane", 1024, "even")
+    away = np.linalg.norm(positions, axis=1) / spacing
+    outside = away > 1.6
+    told = None if evenness is None else np.full(outside.sum(), evenness)
+    found = surfels_of(positions[outside], evenness=told).spacing
+    assert low < found[away[outside] < 2.4].mean() / np.median(found) < high
+
+
 def test_the_shape_is_0_in_a_plane_and_on_a_line():
     planarity, linearity = estimate(shape("plane", 600)[0])["shape_ratios"].T
     assert planarity.max() < 0.01
