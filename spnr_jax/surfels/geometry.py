@@ -364,7 +364,7 @@ def describe_discs(
     random: Bool[Array, ""],
     const: Constants = CONSTANTS,
 ) -> dict[str, Array]:
-    """The fields of `Surfels` that follow from layers and sides (..., points); whether the points are random."""
+    """The fields of `Surfels` that follow from layers and sides (..., points); gaps of random points are covered."""
     layer_spacing, weight = measure_spacings(points, raw_spacing, layer, normal, one_sided, const)
 
     def work(
