@@ -1,4 +1,4 @@
-"""Sparse-point neural rendering: about a thousand surface points with materials in, pictures of the object out.
+"""Sparse-point neural rendering: surface points with materials in, pictures of the object out.
 
 `import spnr_jax` does not import JAX: each public name is imported at its first use.
 """
@@ -34,6 +34,11 @@ def warn_of_wrong_numbers() -> None:
 
 
 warn_of_wrong_numbers()
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return sorted([*__all__, *_KERNELS])
 
 
 def __getattr__(name: str):

@@ -56,7 +56,8 @@ class Method:
     render: Function = lazy("spnr_jax.method.inference:draw_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
     prepare: Function = lazy("spnr_jax.training.batching:prepare")
-    """(config, dataset, run, *, light) -> function (first step) -> iterator of batches."""
+    """(config, dataset, run, *, light) -> function (first step) -> iterator of batches.  ValueError if the data set
+    does not suit; nothing is written before that function is called."""
     loss: Function = lazy("spnr_jax.method.inference:loss")
     """(variables, batch, key, *, config) -> (value, `Outcome`); pure, differentiated by the params in `variables`."""
     discriminator: Function | None = None

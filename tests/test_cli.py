@@ -89,8 +89,13 @@ REFUSED = [  # command, what its line says
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),
     ("export ball.xyz", "a file; expected a run folder, or of a cloud `spnr export ball.xyz --splats"),
     ("render ball.xyz --sun 40", "see spnr render --help"),
-    ("export ball.xyz --light studio", "--splats"),
-    ("export ball.xyz --up z", "--splats"),
+    ("export RUN --light studio", "--light is for --splats"),
+    ("export RUN --sun 40 30", "--sun is for --splats"),
+    ("export RUN --fitting-views 8", "--fitting-views is for --splats"),
+    ("export RUN --up z", "--up is for --splats"),
+    (f"{LIT} --views 0 --turntable none", "--views 0 --turntable none: nothing is left to draw"),
+    (f"{LIT} --outputs", "--outputs"),
+    ("train LIT new --preset tiny", "preset tiny learns one light alone; train --preset surfels"),
     ("export nowhere.ply --splats out.ply", "nowhere.ply"),
     ("export RUN", "a network of method paper cannot be exported; only surfels can"),
     ("share ball.xyz --out ball.xyz/page.html", "a file, not a folder"),
@@ -110,6 +115,10 @@ def test_what_cannot_be_done_is_one_line_and_code_2_and_writes_nothing(
             (tmp_path / name).write_bytes(FILES[name])
     if "UNTESTED" in command:
         tiny_dataset.write_dataset(tmp_path / "UNTESTED", {"train": tiny_dataset.NAMES, "val": (), "test": ()})
+    if "LIT" in command.split():
+        folder = tiny_dataset.write_dataset(tmp_path / "LIT", {"train": tiny_dataset.NAMES, "val": (), "test": ()})
+        settings = json.loads((folder / "dataset.json").read_text()) | {"environment_map": {"kinds": []}}
+        (folder / "dataset.json").write_text(json.dumps(settings))
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     places = {"RUN": run, "DATA": data, "''": ""}

@@ -6,14 +6,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.kernels.numerics import check_alike
+
 
 def l1(image: Float[Array, "*shape"], reference: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Mean absolute difference."""
+    """Mean absolute difference.  ValueError for different shapes or whole numbers."""
+    check_alike("l1", image, reference)
     return jnp.mean(jnp.abs(image - reference))
 
 
 def mse(image: Float[Array, "*shape"], reference: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Mean squared difference."""
+    """Mean squared difference.  ValueError for different shapes or whole numbers."""
+    check_alike("mse", image, reference)
     return jnp.mean((image - reference) ** 2)
 
 

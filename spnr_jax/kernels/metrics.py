@@ -1,6 +1,6 @@
 """Image quality: one number per image, never an average that hides its denominator.
 
-Images are float RGB in [0, 1] on white, (*batch, height, width, 3).
+Images are float RGB in [0, 1] on white, (*batch, height, width, 3); ValueError for others, or of different shapes.
 """
 
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.numerics import safe_divide
+from spnr_jax.kernels.numerics import check_alike, safe_divide
 
 PSNR_CAP = 100.0  # dB, of identical images
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # gaussian window of Wang et al. 2004, cut at 3.5 sigma as scikit-image does
@@ -26,6 +26,7 @@ def psnr(
     image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"]
 ) -> Float[Array, "*batch"]:
     """Peak signal-to-noise ratio in dB, at most 100."""
+    check_alike("psnr", image, reference)
     return _decibel(jnp.mean((image - reference) ** 2, axis=(-3, -2, -1)))
 
 
@@ -35,6 +36,9 @@ def conditional_psnr(
     mask: Bool[Array, "*batch height width"],
 ) -> Float[Array, "*batch"]:
     """PSNR over the condition pixels, at which a visible input point lies; NaN if there is none (skip and count it)."""
+    check_alike("conditional_psnr", image, reference)
+    if np.shape(mask) != np.shape(image)[:-1]:
+        raise UserError(f"conditional_psnr: expected a mask {np.shape(image)[:-1]}, got {np.shape(mask)}")
     squared = jnp.sum(jnp.where(mask[..., None], (image - reference) ** 2, 0), axis=(-3, -2, -1))
     count = 3 * jnp.sum(mask, axis=(-2, -1))
     return jnp.where(count > 0, _decibel(safe_divide(squared, count.astype(squared.dtype))), jnp.nan)
@@ -47,6 +51,7 @@ def ssim(
 
     Off by up to 1e-3 where both images are bright and flat: a small variance is the difference of large squares.
     """
+    check_alike("ssim", image, reference)
     if min(image.shape[-3:-1]) < 2 * SSIM_RADIUS + 1:
         raise UserError(f"ssim needs images of at least {2 * SSIM_RADIUS + 1} pixels, got {image.shape[-3:-1]}")
     taps = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
@@ -82,6 +87,7 @@ def high_frequency_ratio(
 
     Spectra of all channels in a Hann window; a constant does not count.  NaN where the reference has no such energy.
     """
+    check_alike("high_frequency_ratio", image, reference)
     height, width = image.shape[-3:-1]
     rows, columns = (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n) for n in (height, width))
     frequency = np.hypot(2 * np.fft.fftfreq(height)[:, None], 2 * np.fft.fftfreq(width))

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
+from spnr_jax.errors import UserError
+
 # --- numbers and vectors ----------------------------------------------------------------------------------------------
 
 
@@ -93,6 +95,15 @@ def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root; 0 with zero gradient where x is 0 or, by rounding, negative."""
     valid = x > 0
     return jnp.where(valid, jnp.sqrt(jnp.where(valid, x, 1)), 0)
+
+
+def check_alike(where: str, image: Any, reference: Any) -> None:
+    """ValueError unless two pictures have the same shape and are floating-point: others would broadcast, or wrap."""
+    shapes, kinds = [np.shape(x) for x in (image, reference)], [jnp.result_type(x) for x in (image, reference)]
+    if shapes[0] != shapes[1]:
+        raise UserError(f"{where}: expected two arrays of the same shape, got {shapes[0]} and {shapes[1]}")
+    if not all(jnp.issubdtype(kind, jnp.floating) for kind in kinds):
+        raise UserError(f"{where}: expected floats in [0, 1], got {kinds[0]} and {kinds[1]}")
 
 
 def array_namespace(*values: Any) -> ModuleType:

@@ -67,7 +67,8 @@ class Rays:
 class Rendering:
     """The result of a rendering: `image` after the upsampler, the rest at the resolution of the volume rendering.
 
-    `depth` is the expected distance along the ray (the far side of the box where nothing is hit), `acc` the opacity.
+    `depth` is the expected distance along the ray (where nothing is hit: the far side of the box, or 0 beside it),
+    `acc` the opacity.
     """
 
     image: Float[Array, "*batch height width 3"]
@@ -177,13 +178,14 @@ class Light:
 
         Exact for multiples of a texel, 5.625 degrees; otherwise texels are interpolated.  The angle may be traced.
         """
-        xp = array_namespace(degrees)
-        columns = -degrees / 360 * self.tables.shape[-2]  # columns run against the azimuth
+        xp = array_namespace(degrees, self.tables)
+        tables = xp.asarray(self.tables)
+        columns = -degrees / 360 * tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
         part = columns - whole
         # indices: jnp.roll would be compiled for every shift
-        places = xp.arange(self.tables.shape[-2]) - whole.astype(int)
-        near, far = (self.tables[..., (places - i) % len(places), :] for i in (0, 1))
+        places = xp.arange(tables.shape[-2]) - whole.astype(int)
+        near, far = (tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
 
 

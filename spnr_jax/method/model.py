@@ -61,6 +61,10 @@ class Model:
         for name, values in vars(cloud).items():
             if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
                 raise UserError(f"the cloud has NaN or infinity in its {name}; remove those points")
+        for name in ("base_color", "roughness", "metallic"):
+            given = np.asarray(getattr(cloud, name))[mask]
+            if given.min() < 0 or given.max() > 1:
+                raise UserError(f"the cloud's {name} is {given.min():g} to {given.max():g}; expected 0 to 1, linear")
         centre, scale = cloud_arrays.normalization(positions[mask])
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)

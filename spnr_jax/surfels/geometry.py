@@ -462,7 +462,13 @@ def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where
 
 
 def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
-    """The cloud normalised to the box [-1, 1]^3, and the centre and scale of this transform."""
+    """The cloud normalised to the box [-1, 1]^3, in at least float32, and the centre and scale of this transform."""
+
+    def promote(values: AnyArray) -> Array:
+        values = jnp.asarray(values)
+        return values if values.dtype == jnp.bool_ else values.astype(jnp.promote_types(values.dtype, jnp.float32))
+
+    cloud = jax.tree.map(promote, cloud)
     positions = jnp.asarray(cloud.positions)
     centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
     inside = clamp((positions - centre[None]) * scale, -1, 1)

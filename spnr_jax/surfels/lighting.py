@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import array_namespace, clamp, larger, safe_sqrt, smaller, split_columns
 from spnr_jax.kernels.records import AnyArray, Light, Surfels
 from spnr_jax.surfels.sides import DIRECTIONS
@@ -88,8 +89,13 @@ def _lobes() -> Float[np.ndarray, "tables texels texels"]:
 
 
 def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
-    """The light of a map of any size whose width is twice its height; energy is preserved.  The map may be traced."""
-    xp = array_namespace(envmap)
+    """The light of a map of any size whose width is twice its height; energy is preserved.  The map may be traced.
+
+    ValueError for another shape.
+    """
+    xp, shape = array_namespace(envmap), np.shape(envmap)
+    if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0]:
+        raise UserError(f"light_of: expected a map (height, 2 height, 3), got {shape}")
     small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
     tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
     return Light(tables=xp.concatenate([tables[:1], small[None], tables[1:]]))

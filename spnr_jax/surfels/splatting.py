@@ -146,7 +146,7 @@ def _rectangles(
 
 
 def count_entries(covered: Int[Array, " points"]) -> Int[Array, ""]:
-    """Sum of the pixels that discs cover, at most MOST."""
+    """Sum of the pixels that discs cover, at most MOST_COUNTED."""
     return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST_COUNTED).astype(jnp.int32)
 
 

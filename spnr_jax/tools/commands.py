@@ -5,7 +5,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -14,6 +14,12 @@ from spnr_jax.config import Cut, Schedule, TrainConfig
 from spnr_jax.errors import UserError, require, require_at_least, require_within
 
 MOST_STOPS = 20
+
+
+def changed_options(options: Any) -> tuple[str, ...]:
+    """Names of the options that differ from their defaults."""
+    changed = (field.name for field in dataclasses.fields(options) if getattr(options, field.name) != field.default)
+    return tuple(f"--{name.replace('_', '-')}" for name in changed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +37,6 @@ class Lighting:
     """Stops by which the light is brighter (negative: darker)."""
     background: Literal["white", "light"] = "white"
     """Background: white, or the environment map, blurred."""
-
-    @property
-    def is_given(self) -> tuple[str, ...]:
-        """Names of the options that are not as they are where nothing is asked of the light."""
-        given = (field.name for field in dataclasses.fields(self) if getattr(self, field.name) != field.default)
-        return tuple(f"--{name.replace('_', '-')}" for name in given)
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -169,7 +169,7 @@ class Render(ReadOptions):
     @property
     def light_options_given(self) -> tuple[str, ...]:
         """Names of the options that need a network that takes a light."""
-        return (*self.lighting.is_given, *(("--turn light",) if self.turn == "light" else ()))
+        return (*changed_options(self.lighting), *(("--turn light",) if self.turn == "light" else ()))
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
@@ -177,6 +177,8 @@ class Render(ReadOptions):
         names = [cloud.stem for cloud in (self.cloud, *self.others)]
         require(len(set(names)) == len(names), "two clouds have one name; give them an --out each")
         require_at_least(self, 0, "views")
+        require(len(self.outputs) > 0, "--outputs: expected one or more of image, depth, opacity")
+        require(self.views > 0 or self.turntable != "none", "--views 0 --turntable none: nothing is left to draw")
         require_at_least(self, 1, "frames", "fps")
         require_within(self, -90, 90, "elevation")
         if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
@@ -253,12 +255,9 @@ class Export:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
-        given = [name for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
-        given += ["light"] if self.lighting.is_given else []
-        given += ["most-splats"] if self.making != SplatOptions() else []
-        require(
-            self.splats is not None or not given, f"--{''.join(given[:1])} is for --splats FILE, which is not given"
-        )
+        given = [f"--{name}" for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
+        given += [*changed_options(self.lighting), *changed_options(self.making)]
+        require(self.splats is not None or not given, f"{''.join(given[:1])} is for --splats FILE, which is not given")
         at_white = self.lighting.background == "white"
         require(at_white, "--background light: splats have no background; leave it out")
 

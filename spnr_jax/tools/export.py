@@ -170,6 +170,7 @@ def export_network(options: Export) -> str:
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
     model = Model(config=trained.config.model, variables=trained.variables)
     _check_exportable(model)
+    images.check_place(out / "weights.npz")
     points, size = options.num_points or 1024, options.resolution
     functions = {
         "encode": export_encode(model, num_points=points, platforms=where),

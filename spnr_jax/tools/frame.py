@@ -23,7 +23,7 @@ from spnr_jax.formats import images
 from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.tools.commands import Lighting
+from spnr_jax.tools.commands import Lighting, changed_options
 from spnr_jax.tools.pictures import light_of_options, put_background
 
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
@@ -78,7 +78,7 @@ def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -
     """The initial state for a cloud; ValueError if it cannot be encoded, or if the light is no map."""
     state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting)
     if lighting.light is None or lighting.light in NAMES:
-        return relight(state, lighting) if lighting.is_given else state
+        return relight(state, lighting) if changed_options(lighting) else state
     return add_map(state, display_name(Path(lighting.light).name), read_light(lighting.light))
 
 

@@ -167,9 +167,11 @@ def _draw(ready: PreparedObject, views: list[View], options: Render) -> Iterator
 
 
 def _write_still(stem: str, files: Iterator[tuple[str, bytes]]) -> str:
+    written = []
     for suffix, data in files:
-        images.write_whole(Path(stem + suffix), data)
-    return f"wrote {stem}.png"
+        images.write_whole(path := Path(stem + suffix), data)
+        written.append(path)
+    return f"wrote {written[0]}"
 
 
 def _write_film(path: Path, film: list[np.ndarray], options: Render) -> str:

@@ -84,10 +84,17 @@ class View(NamedTuple):
 def prepare(
     config: TrainConfig, dataset: Dataset, run: Path, *, light: Light | None
 ) -> Callable[[int], Generator[Crops, None, None]]:
-    """A function from a step to the training batches from there on.  Missing G-buffers are made first (slow)."""
-    variables = add_companions(config.model, {}, run)
-    views = make_missing(dataset, light or choose_light(dataset), config, run / "gbuffers", variables)
-    return lambda first_step: batches(views, config, first_step)
+    """A function from a step to the training batches from there on.  It makes missing G-buffers first (slow).
+
+    ValueError if the light of the data set is not known.
+    """
+    light = light or choose_light(dataset)
+
+    def batches_from(first_step: int) -> Generator[Crops, None, None]:
+        variables = add_companions(config.model, {}, run)
+        return batches(make_missing(dataset, light, config, run / "gbuffers", variables), config, first_step)
+
+    return batches_from
 
 
 def choose_light(dataset: Dataset) -> Light:

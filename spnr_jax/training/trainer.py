@@ -58,12 +58,13 @@ def train(
     """
     runtime.limit_arenas()
     programs.check_divides(mesh, config.batch_objects)
+    # before the run folder is made: data that do not suit leave nothing
+    batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
     with checkpoint.lock_run(run), ExitStack() as stack:
         checkpoint.write_config(run, config)
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
-        batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
         requests = stack.enter_context(stop_requests())
         log = stack.enter_context(closing(MetricsLog(run, first, config.num_steps)))
         batches = stack.enter_context(closing(batches_from(first)))

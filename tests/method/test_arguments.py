@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import spnr_jax
+
 CALLS = {
     "neighbors(cloud.replace(positions=np.zeros((9, 2))))": "neighbors: cloud.positions has the shape (9, 2), expected",
     "neighbors(cloud.replace(positions=np.full((9, 3), np.nan)))": "neighbors: cloud.positions has NaN or infinity",
@@ -22,6 +24,14 @@ CALLS = {
     "model.render(None, camera, light='studio')": "light: expected a Light",
     "model.camera(scene, resolution=0)": "resolution must be at least 1 pixel, got 0",
     "light * light": "unsupported operand type",
+    "spnr_jax.light_of(np.ones((64, 64, 3)))": "light_of: expected a map (height, 2 height, 3), got (64, 64, 3)",
+    "spnr_jax.light_of(np.ones((32, 64)))": "light_of: expected a map (height, 2 height, 3), got (32, 64)",
+    "model.encode(cloud.replace(base_color=np.full((9, 3), 200, np.uint8)))": "the cloud's base_color is 200 to 200",
+    "model.encode(cloud.replace(roughness=-rows[2, :, 0]))": "the cloud's roughness is -",
+    "spnr_jax.metrics.psnr(rows[0], rows[0, :1])": "psnr: expected two arrays of the same shape, got (9, 3) and (1, 3)",
+    "spnr_jax.metrics.conditional_psnr(rows, rows, rows[0] > 0)": "conditional_psnr: expected a mask (4, 9), got",
+    "spnr_jax.losses.l1(rows, rows[0])": "l1: expected two arrays of the same shape, got (4, 9, 3) and (9, 3)",
+    "spnr_jax.losses.mse(cloud.mask, cloud.mask)": "mse: expected floats in [0, 1], got bool and bool",
 }
 SCRIPT = """
 import json, sys
@@ -52,3 +62,8 @@ def test_arguments_that_do_not_fit_are_named_in_one_line():
     for (call, expected), said in zip(CALLS.items(), json.loads(done.stdout), strict=True):
         assert said.startswith(expected), call
         assert "\n" not in said
+
+
+def test_the_package_lists_its_public_names():
+    assert {"load", "render", "PointCloud", "metrics"} <= set(dir(spnr_jax))
+    assert all(hasattr(spnr_jax, name) for name in dir(spnr_jax))

@@ -243,3 +243,13 @@ def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program(
         close(np.asarray(found.surfels.position)[order], positions[np.lexsort(positions.T)])
         programs.add(count_programs())
     assert len(programs) == 1
+
+
+@pytest.mark.parametrize("half", [np.float16, jnp.bfloat16])
+def test_half_floats_are_computed_in_float32(half):
+    points = pad(cloud(shape("sphere", COUNT, "random")[0]), SIZE)
+    halves = jax.tree.map(lambda x: x if x.dtype == np.bool_ else x.astype(half), points)
+    wide = jax.tree.map(lambda x: x if x.dtype == np.bool_ else np.asarray(x, np.float32), halves)
+    jax.tree.map(np.testing.assert_array_equal, *map(geometry.normalise_cloud, (halves, wide)))
+    scene = jax.eval_shape(plain, halves, spnr_jax.neighbors(wide))
+    assert {x.dtype for x in jax.tree.leaves(scene)} == {jnp.dtype(np.float32), jnp.dtype(np.bool_)}

@@ -7,6 +7,7 @@ import pytest
 from support.laws import close, numbers
 from support.surfel_clouds import surfels
 
+from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import lighting, skies
 from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of, resample, solid_angles, texel_directions
@@ -139,6 +140,11 @@ def test_the_harmonics_are_orthonormal_and_project_light_in_the_axes_of_the_came
 
 
 def test_lamps_and_turned_lights_of_traced_angles_are_those_of_numbers_and_have_gradients():
+    studio = read_light("studio")  # of NumPy arrays
+    close(
+        jax.jit(lambda degrees: studio.turned(degrees).tables)(17.0), studio.turned(17.0).tables, rtol=1e-5, atol=1e-5
+    )
+
     def shone(azimuth, elevation, degrees):
         return skies.sun(azimuth, elevation, 30.0).turned(degrees).tables
 

@@ -86,6 +86,9 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
     rendered(cloud_file(tmp_path), out, turntable="none", outputs=("image",), transparent=True)
     assert names(out) == {"chair_000.png", "chair_001.png", "chair_cameras.json"}
     assert shown(out / "chair_000.png").shape == (24, 24, 4)
+    lines = rendered(cloud_file(tmp_path), tmp_path / "other", turntable="none", views=1, outputs=("opacity",))
+    assert names(tmp_path / "other") == {"chair_000_opacity.png", "chair_cameras.json"}
+    assert f"wrote {tmp_path / 'other' / 'chair_000_opacity.png'}" in lines
 
 
 @pytest.mark.ci
