@@ -30,7 +30,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import LONGEST_NAME, Columns, srgb_to_linear
+from spnr_jax.formats.columns import LONGEST_NAME, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
@@ -96,8 +96,8 @@ class Part:
 class Asset:
     """One object: its parts, what kind it is, and what its source holds that is not modelled (named, never silent).
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing; `points` the columns
-    of the vertices of a file without faces.
+    `notes` are sentences about what was made of transparent parts and of files that are missing.  The parts of a file
+    of points have vertices and no faces.
     """
 
     parts: tuple[Part, ...] = ()
@@ -105,7 +105,6 @@ class Asset:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     source: dict = field(default_factory=dict)
-    points: Columns | None = None
 
 
 def make_material(base_color: Any = 0.5, roughness: Any = 0.5, metallic: Any = 0.0, wrap: Wrap = "repeat") -> Material:
@@ -125,15 +124,13 @@ class Loading:
     """One reading of a mesh file: where its companions lie, what may be missing, and what became of it.
 
     `folder` is the mesh's; `root` is the object's, that one or one above it: a ShapeNet object keeps its images beside
-    the folder of its mesh (`../images`).  `ignored` names what the file holds that is not modelled, `points` are the
-    columns of the vertices of a file without faces.
+    the folder of its mesh (`../images`).  `ignored` names what the file holds that is not modelled.
     """
 
     def __init__(self, folder: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse"):
         self.folder, self.root, self.transparent_parts = folder, root or folder, transparent_parts
         self.strict = transparent_parts == "refuse"  # the object is wanted as it is, or not at all
         self.ignored: set[str] = set()
-        self.points: Columns | None = None
         self._said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in their order
 
     def read(self, uri: str, needed: bool = False) -> bytes | None:

@@ -24,12 +24,13 @@ from trimesh.transformations import quaternion_matrix
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels, make_material
-from spnr_jax.formats.columns import LINEAR, LONGEST_NAME, NORMAL, Columns
+from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 CHUNK_JSON = 0x4E4F534A  # of a .glb
+LOOSE = {"POINTS", "LINES", "LINE_LOOP", "LINE_STRIP"}
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
@@ -54,7 +55,7 @@ WORKFLOWS = (  # textures of colour and of reflection, a stand-in for the latter
     ("baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"),
     ("diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"),
 )
-# Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
+# Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
 # costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
 
@@ -66,30 +67,34 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     for extension in document.get("extensionsRequired", []):
         if extension not in (*READABLE, SPLATS) and not extension.startswith("KHR_materials_"):
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
-    if not loading.strict and (points := _points(file, drawn)):
-        loading.points = points
-        return []
+    modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
+    # points are read where there is nothing else
+    wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
     ignored |= {key for key in ("animations", "skins") if document.get(key)}
     ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
     read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
     for primitive, matrix in drawn:
-        if not (mode := MODES[primitive.get("mode", 4)]).startswith("TRIANGLE"):
+        if not (mode := modes[id(primitive)]).startswith(wanted):
             ignored.add(f"{mode} primitives")
             continue
-        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+        extensions = primitive.get("extensions", {})
+        if SPLATS in extensions:
+            raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
+        ignored |= {"KHR_materials_variants"}.intersection(extensions)
+        ignored |= {f"attribute {name[:LONGEST_NAME]}" for name in primitive["attributes"] if name.startswith("_")}
         ignored |= {"morph targets"} if primitive.get("targets") else set()
         number, key = primitive.get("material"), id(primitive)
         material, placement = read_look(number)
         if material is None:
             continue
         if key in shapes:
-            repeated += len(shapes[key][1]) + PLACING
+            repeated += len(shapes[key][0]["POSITION"]) + len(shapes[key][1]) + PLACING
         else:
             shapes[key] = _shape(file, primitive, mode, f"TEXCOORD_{placement.texcoord_set}")
         if repeated > MOST_REPEATED:
-            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
+            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
         if asks_alpha and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
@@ -124,32 +129,6 @@ def list_primitives(document: dict) -> Iterator[tuple[dict, np.ndarray]]:
         stack += [(child, parent @ own) for child in reversed(node.get("children", []))]
 
 
-def _points(file: "GltfFile", drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
-    """The columns of the points of a scene without triangles; None if it has some, or no points either."""
-    modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
-    if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
-        return None
-    pieces: list[Columns] = []
-    colored = False
-    for primitive, matrix in (pair for pair in drawn if pair[0].get("mode") == 0):
-        if SPLATS in primitive.get("extensions", {}):
-            raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
-        columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0")
-        part = _place(columns, np.zeros((0, 3), np.int64), make_material(), Placement(), matrix)
-        look = file.document["materials"][primitive["material"]] if "material" in primitive else {}
-        factor = look.get("pbrMetallicRoughness", {}).get("baseColorFactor")
-        colored |= factor is not None or part.colors is not None
-        rgba = columns.get("COLOR_0", np.ones((len(part.positions), 4)))
-        rgba = rgba * (factor or (1, 1, 1, 1))[: rgba.shape[1]]
-        values = zip((*"xyz", *LINEAR, "alpha"), (*part.positions.T, *rgba.T), strict=False)
-        found = dict(values) | dict(zip(NORMAL, () if part.normals is None else part.normals.T, strict=False))
-        rows = file.accessor(primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive else slice(None)
-        pieces.append({name: column[rows] for name, column in found.items()})
-    left_out = () if colored else LINEAR
-    shared = [name for name in pieces[0] if all(name in piece for piece in pieces) and name not in left_out]
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in shared}
-
-
 def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
     """The columns (v, width) that a material needs, and the faces (f, 3), of a primitive in its own frame."""
     if DRACO in primitive.get("extensions", {}):
@@ -159,6 +138,8 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     order = np.arange(len(columns["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    if mode == "POINTS":
+        return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_STRIP":
         return columns, strip_faces(order)
     if mode == "TRIANGLE_FAN":

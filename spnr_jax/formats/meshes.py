@@ -58,11 +58,11 @@ def load_mesh(
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
         parts = READERS[kind](path, loading)
-        if loading.strict or loading.points is None:
+        if loading.strict or not parts or any(len(part.faces) for part in parts):
             parts = assemble(parts, loading)
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     ignored, notes = tuple(sorted(loading.ignored)), loading.notes()
-    return Asset(parts=tuple(parts), points=loading.points, ignored=ignored, notes=notes, source=source)
+    return Asset(parts=tuple(parts), ignored=ignored, notes=notes, source=source)
 
 
 def assemble(parts: list[Part], loading: Loading) -> list[Part]:

@@ -16,7 +16,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
+from spnr_jax.formats.columns import SRGB, Columns, colors_of, full_scale
 from spnr_jax.formats.point_tables import open_text
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
@@ -39,15 +39,18 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
     columns = _columns(text, loading)
+    colors, notes = colors_of(columns) or (None, [])
+    loading.say(*notes)
     if not text["f sizes"]:
-        loading.points = columns
-        return []
+        normals = _table(text["vn"], 3) if len(text["vn"]) == len(text["v"]) else None
+        material = make_material(0.5 if colors is None else 1.0)
+        none = np.zeros((0, 3), np.int64)
+        return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
     for names in map(str.strip, text["mtllib"]):  # one name with spaces, or several without
         single = (loading.folder / names).is_file() or len(names.split()) == 1
         for name in [names] if single else names.split():
             library |= parse_mtl(loading.read(name) or b"")
-    colors, notes = colors_of(columns) or (None, [])
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text["usemtl"]):
         looks[name] = make_material() if not name else _look(name, library.get(name), loading)
@@ -60,7 +63,6 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         loading.ignored.add(f"{loose:,} vertices of no face")
     if text["vn"] and any(part.normals is None for part in parts):
         loading.ignored.add("normals that only some faces have (flat shading is used)")
-    loading.say(*notes)
     return parts
 
 
@@ -92,7 +94,7 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
 
 
 def _columns(text: Rests, loading: Loading) -> Columns:
-    """The columns of the vertices: positions, colours where some row has them, normals where no face does."""
+    """The columns of the vertices: positions, and colours where some row has them."""
     try:
         table = _table(text["v"], None)
     except ValueError:  # rows of different lengths
@@ -105,10 +107,7 @@ def _columns(text: Rests, loading: Loading) -> Columns:
             loading.say(f"{np.sum(~with_color):,} of {len(table):,} vertices have no colour: the others' mean is taken")
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
-    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
-    if not text["f sizes"] and len(text["vn"]) == len(table):
-        columns |= dict(zip(NORMAL, _table(text["vn"], 3).T, strict=True))
-    return columns
+    return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
 
 
 def _parts(

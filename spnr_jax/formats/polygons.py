@@ -117,19 +117,16 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     table = np.loadtxt(rows[:num_vertices], ndmin=2) if num_vertices else np.zeros((0, 3))
     columns = dict(zip(names, table.T, strict=False))
     faces = [[float(word) for word in row.split()] for row in rows[num_vertices:][:num_faces]]
-    if not faces:
-        loading.points = columns
-        return []
-    sizes = np.array([int(face[0]) for face in faces])
+    sizes = np.array([int(face[0]) for face in faces], np.int64)
     corners = [face[1 : 1 + size] for face, size in zip(faces, sizes, strict=True)]
     if [len(own) for own in corners] != sizes.tolist():
         raise UserError("is cut off: a face names fewer corners than it announces")
     behind = [face[1 + size :] for face, size in zip(faces, sizes, strict=True)]
-    colored = all(len(values) in (3, 4) for values in behind)
+    colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
         loading.ignored.add("colours of some faces alone")
-    return _colored(columns, np.concatenate(corners), sizes, of_faces, loading)
+    return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
@@ -141,7 +138,7 @@ def _colored(
     """The part of polygons of so many corners, with the colours of their vertices, else those of the polygons."""
     columns = useful(vertices)
     positions = stack_columns(columns)
-    if loose := len(positions) - len(np.unique(corners)):
+    if len(corners) and (loose := len(positions) - len(np.unique(corners))):
         loading.ignored.add(f"{loose:,} vertices of no face")
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
