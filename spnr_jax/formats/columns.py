@@ -32,29 +32,35 @@ POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
-ALIASES = (  # ours first, then what stands for it: the first group that is there counts
-    (
-        *("x y z", "points_0 points_1 points_2", "points_m_xyz_0 points_m_xyz_1 points_m_xyz_2", "pos_x pos_y pos_z"),
-        *("position_x position_y position_z", "location_x location_y location_z", "point_x point_y point_z"),
-        *("x_m y_m z_m", "x_coord y_coord z_coord", "px py pz", "easting northing elevation"),
-        *("easting northing height", "e n h", "x y height", "x y elevation"),
-    ),
-    (
-        *("base_color_r base_color_g base_color_b", "base_color_red base_color_green base_color_blue"),
-        *("basecolor_r basecolor_g basecolor_b", "albedo_r albedo_g albedo_b"),
-    ),
-    (
-        *("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "diffuse_r diffuse_g diffuse_b"),
-        *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue", "colorr colorg colorb"),
-        *("rgb_0 rgb_1 rgb_2", "colors_0 colors_1 colors_2", "vertex_red vertex_green vertex_blue"),
-    ),
-    ("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz", "normals_0 normals_1 normals_2"),
-    ("roughness", "rough", "roughness_factor", "pbr_roughness"),
-    ("metallic", "metalness", "metallic_factor", "metal", "pbr_metallic"),
-    ("intensity", "reflectance", "reflectivity", "amplitude", "gray", "grey"),
-    ("alpha", "a", "diffuse_alpha", "color_a"),
-    *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
-)
+AXES, CHANNELS = ("x y z", "0 1 2"), ("r g b", "red green blue", "0 1 2")
+STEMS = {  # ours: what the names of others, without separators, begin with; how they end; the first that is there counts
+    POSITION: (" points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p", AXES),
+    LINEAR: ("basecolor albedo", CHANNELS),
+    SRGB: (" color colors rgb diffuse vertex", CHANNELS),
+    NORMAL: ("n normal normals", AXES),
+}
+ALIASES = {
+    names: [
+        [stem + end for end in own.split()] for stem in stems.split(" ") for own in endings if stem or own != "0 1 2"
+    ]
+    for names, (stems, endings) in STEMS.items()
+}
+ALIASES[POSITION] += [["easting", "northing", height] for height in ("elevation", "height")] + [["xm", "ym", "zm"]]
+ALIASES[POSITION] += [["x", "y", height] for height in ("height", "elevation")]
+ALIASES[SRGB] += [["rf", "gf", "bf"]]
+ALIASES |= {
+    (name,): [[name], *([other] for other in others.split())]
+    for name, others in {
+        "roughness": "rough roughnessfactor pbrroughness",
+        "metallic": "metalness metallicfactor metal pbrmetallic",
+        "intensity": "reflectance reflectivity amplitude gray grey",
+        "alpha": "a diffusealpha colora rgb3 color3 colors3",
+        **dict.fromkeys(("rgb", "rgba", "opacity", "classification", "withheld"), ""),
+        "splat_opacity": "splatopacity",
+    }.items()
+}
+ARRAYS = {stem for stems, _ in STEMS.values() for stem in stems.split()}  # names of arrays of several columns
+ARRAYS |= {name for group in ALIASES.values() for names in group for name in names}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
@@ -69,17 +75,39 @@ FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog,
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
+def name_columns(fields: dict[str, np.ndarray]) -> Columns:
+    """Columns (points,) of fields of numbers (points,) or (points, c); of two to four of one name name:0, name:1 ...
+
+    So ParaView names them; fields of more numbers are none.
+    """
+    columns: Columns = {}
+    for name, values in (
+        (name.lower(), x) for name, x in fields.items() if x.dtype.kind in "fiub" and x.ndim in (1, 2)
+    ):
+        width = values.size // len(values) if values.ndim == 2 and len(values) else 1
+        if width < 2:
+            columns[name] = values.reshape(-1)
+        elif width < 5:
+            columns |= {f"{name}:{i}": values[:, i] for i in range(width)}
+    return columns
+
+
+def plain_name(name: str) -> str:
+    """A name without its separators."""
+    return re.sub(r"[\s.:_-]+", "", name.strip().lower().removeprefix(PREFIX))
+
+
 def rename(columns: Columns) -> Columns:
     """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
-    plain = {re.sub(r"[\s.:_-]+", "_", name.strip().removeprefix(PREFIX)): x for name, x in columns.items()} | columns
+    plain = {plain_name(name): x for name, x in columns.items()}
     found: Columns = {}
-    for group in ALIASES:
-        names = next((names.split() for names in group if set(names.split()) <= plain.keys()), [])
-        found |= dict(zip(group[0].split(), (plain[name] for name in names), strict=False))
-    if set(SPLAT) <= plain.keys():
+    for ours, theirs in ALIASES.items():
+        names = next((names for names in theirs if set(names) <= plain.keys()), [])
+        found |= dict(zip(ours, (plain[name] for name in names), strict=False))
+    if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
-            found[name] = np.clip(0.5 + C0 * np.asarray(plain[constant], np.float64), 0, 1)
-    if "opacity" in found and plain.keys() & {SPLAT[0], "scale_0", "rot_0"}:
+            found[name] = np.clip(0.5 + C0 * np.asarray(columns[constant], np.float64), 0, 1)
+    if "opacity" in found and columns.keys() & {SPLAT[0], "scale_0", "rot_0"}:
         found["splat_opacity"] = found.pop("opacity")
     return {name: x for name, x in found.items() if name not in ("rgb", "rgba") or x.dtype.itemsize >= 4}
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns, Report
+from spnr_jax.formats.columns import Columns, Report, name_columns
 from spnr_jax.formats.point_tables import load_text
 
 Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
@@ -50,8 +50,7 @@ LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, les
 def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool) -> Iterator[tuple[Columns, Lists]]:
     """Columns and lists of `count` rows from the file's place on, some at a time.
 
-    Two to four numbers of one name are columns name:0, name:1 ..., as ParaView names them; more are none.  Rows whose
-    lists are as long as those of the first are read at once, others one by one.
+    Rows whose lists are as long as those of the first are read at once, others one by one.
     """
     lists, done = [name for name, _, width in properties if isinstance(width, str)], 0
     if not count or not properties:
@@ -97,13 +96,8 @@ def report_further_rows(file: BufferedIOBase, count: int, properties: Properties
 
 def _columns(properties: Properties, rows: Any) -> Columns:
     """The columns of rows, or of the values of properties by their names."""
-    columns: Columns = {}
-    for name, _, width in properties:
-        if width == 1:
-            columns[name] = rows[name]
-        elif width in (2, 3, 4):
-            columns |= {f"{name}:{i}": rows[name].reshape(-1, width)[:, i] for i in range(width)}
-    return columns
+    fields = [(name, width) for name, _, width in properties if not isinstance(width, str)]
+    return name_columns({name: rows[name].reshape(-1, width) for name, width in fields})
 
 
 def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, int]:
