@@ -17,8 +17,7 @@ are made (`refuse`).  For a picture, a missing image leaves plain values, and of
 import base64
 import importlib
 import io
-import os
-import re
+import itertools
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,7 +44,6 @@ MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
 SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
-OUTSIDE = re.compile(r"\.\.?($|/)|/|[^/]*:")  # how the normalised name of a file begins that is not in the folder
 
 
 def extra(package: str, name: str = "meshes") -> Any:
@@ -136,42 +134,30 @@ class Loading:
     def read(self, uri: str, needed: bool = False) -> bytes | None:
         """Bytes of the file that `uri` names (percent escapes as in glTF), or of a data URI; None where it is missing.
 
-        A name in a mesh file is somebody else's text: nothing that leads out of the object's folder or to the network
-        is read.  A path of another machine, or a name in other capitals, means the file of that name beside the mesh.
-        UserError for a missing file that is `needed`, as all are where the reading is strict.
+        A name in a mesh file is somebody else's text.  It means the file at its longest end, in any letter case, that
+        is in the mesh's folder or in one above it up to the object's: nothing outside or on the network is read, and a
+        path of another machine still finds what lies beside the mesh.  UserError for a missing file that is `needed`,
+        as all are where the reading is strict.
         """
         if uri.startswith("data:"):
             head, _, payload = uri.partition(",")
             with refusing("holds a data URI that is not base64"):
                 data = unquote_to_bytes(payload)
                 return base64.b64decode(payload, validate=True) if head.endswith(";base64") else data
-        above = self.folder.relative_to(self.root).parts
-        # parent steps are resolved in the text, so that a link among the folders cannot lead them elsewhere
-        names = [os.path.normpath(os.path.join(*above, x.replace("\\", "/"))) for x in (uri, unquote(uri))]
-        inside = [self.root / name for name in names if not OUTSIDE.match(name)]
-        for place in [*inside, self._beside(unquote(uri))]:
-            if place is not None and place.is_file():
-                return place.read_bytes()
-        reason = f"names a file {'outside its own folder' if OUTSIDE.match(names[1]) else 'that is missing'}"
-        self.go_on_without(reason, repr(unquote(uri)), needed)
+        names = dict.fromkeys(text.replace("\\", "/") for text in (uri, unquote(uri)))
+        folders = [x for x in (self.folder, *self.folder.parents) if x.is_relative_to(self.root)]
+        for name, folder in itertools.product(names, folders):
+            parts = [part for part in name.split("/") if part not in ("", ".")]
+            for start in range(len(parts)):
+                if place := _find(folder, parts[start:]):
+                    return place.read_bytes()
+        self.go_on_without("names a file that is missing", repr(unquote(uri)), needed)
         return None
 
     def read_image(self, uri: str) -> np.ndarray | None:
         """Texels (h, w, 4) of the image that `uri` names; None where it is missing."""
         data = self.read(uri)
         return None if data is None else read_image(data, uri[:80])
-
-    def _beside(self, name: str) -> Path | None:
-        """The file that a path of another machine means: its longest end that is in the folder, in any letter case."""
-        names = name.replace("\\", "/").casefold().split("/")
-        for start in range(len(names)):
-            place: Path | None = self.folder
-            for name in names[start:]:
-                inside = sorted(place.iterdir()) if place and place.is_dir() else []
-                place = next((path for path in inside if path.name.casefold() == name), None)
-            if place:
-                return place
-        return None
 
     def say(self, *sentences: str, about: str = "") -> None:
         """Keeps sentences for the notes, or a name for one that begins so."""
@@ -219,6 +205,18 @@ class Loading:
         if surface.all() or not surface.any():
             return material if surface.any() else None
         return replace(material, opacity=alpha.astype(np.float32), cutoff=limit)
+
+
+def _find(folder: Path, names: list[str]) -> Path | None:
+    """The file at names, in any letter case, below a folder; the very names are preferred."""
+    for name in names:
+        if not folder.is_dir():
+            return None
+        inside = sorted(path for path in folder.iterdir() if path.name.casefold() == name.casefold())
+        if not inside:
+            return None
+        folder = next((path for path in inside if path.name == name), inside[0])
+    return folder if folder.is_file() else None
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------

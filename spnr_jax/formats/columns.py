@@ -33,13 +33,14 @@ LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green"
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
 AXES, CHANNELS = ("x y z", "0 1 2"), ("r g b", "red green blue", "0 1 2")
-STEMS = {  # ours: what the names of others, without separators, begin with; how they end; the first that is there counts
+# ours -> what the names of others, without separators, begin with, and how they end; the first that is there counts
+STEMS = {
     POSITION: (" points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p", AXES),
     LINEAR: ("basecolor albedo", CHANNELS),
     SRGB: (" color colors rgb diffuse vertex", CHANNELS),
     NORMAL: ("n normal normals", AXES),
 }
-ALIASES = {
+ALIASES: dict[tuple[str, ...], list[list[str]]] = {
     names: [
         [stem + end for end in own.split()] for stem in stems.split(" ") for own in endings if stem or own != "0 1 2"
     ]

@@ -1,13 +1,10 @@
-"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read; compressed .ply, read.
+"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read.
 
     .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
             function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
     .spz    gzip; a header of 16 bytes, then all places (24-bit fixed point an axis), all opacities (8 bits), colours,
             logarithms of scales, rotations (32 bits), harmonics; axes right, up, back.  Versions 2 and 3 are read
-    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats, which store their place in it as 11, 10
-            and 11 bits, and their colour and opacity as 8 bits each
-
-The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
+Both say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
 with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light, becomes a
 comment of the .ply; a .spz has no place for one.  What is read are coloured points; `splat_opacity` is 0 to 1.
 """
@@ -37,7 +34,6 @@ HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
 PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
 MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
 COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
-CHUNK = 256  # splats
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
@@ -148,25 +144,3 @@ def spz_columns(path: Path) -> Columns:
     colors = (octets[10 * count :].reshape(count, 3) / 255 - 0.5) / COLOR_STEP * C0 + 0.5
     columns = np.concatenate([fixed * 0.5**bits, np.clip(colors, 0, 1), octets[9 * count : 10 * count, None] / 255], 1)
     return dict(zip((*"xyz", *SRGB, "splat_opacity"), columns.T, strict=True))
-
-
-def decompress_columns(chunks: Columns, packed: Columns) -> Columns:
-    """The columns of a compressed .ply from its elements `chunk` and `vertex`."""
-    columns = {}
-    try:
-        place, color = (np.asarray(packed[name], np.uint32) for name in ("packed_position", "packed_color"))
-        row, boxes = np.arange(len(place)) // CHUNK, len(chunks["min_x"])
-        if len(place) and row[-1] >= boxes:
-            raise UserError(f"has {len(place)} splats in {boxes} chunks: broken file")
-        bits = {"x": (place, 21, 11), "y": (place, 11, 10), "z": (place, 0, 11)}
-        bits |= {name: (color, shift, 8) for name, shift in zip((*SRGB, "splat_opacity"), (24, 16, 8, 0), strict=True)}
-        for name, (words, shift, size) in bits.items():
-            columns[name] = (words >> shift & 2**size - 1) / (2**size - 1)
-            if words is place or f"min_{name[0]}" in chunks:
-                low, high = (np.asarray(chunks[f"{end}_{name[0]}"], np.float64)[row] for end in ("min", "max"))
-                columns[name] = low + columns[name] * (high - low)
-            if words is color:
-                columns[name] = np.where(np.isfinite(columns[name]), np.clip(columns[name], 0, 1), np.nan)
-    except KeyError as error:
-        raise UserError(f"is a compressed file of splats without the property {error.args[0]}") from None
-    return columns

@@ -23,7 +23,7 @@ from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels, make_material
+from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
 from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
@@ -55,8 +55,8 @@ WORKFLOWS = (  # textures of colour and of reflection, a stand-in for the latter
     ("baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"),
     ("diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"),
 )
-# Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
-# costs as much as PLACING faces.
+# Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a
+# mesh again costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
 
 

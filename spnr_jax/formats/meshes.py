@@ -17,7 +17,6 @@ import numpy as np
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import CHANNELS, Asset, Loading, Material, Part, TransparentParts, make_material
-from spnr_jax.formats.columns import full_scale
 from spnr_jax.formats.gltf import load_gltf
 from spnr_jax.formats.obj import load_obj
 from spnr_jax.formats.polygons import PLAIN
@@ -165,13 +164,11 @@ def _check_colors(part: Part, ignored: set[str]) -> np.ndarray | None:
         return None
     if not np.isfinite(part.colors).all():
         raise UserError("has vertex colours that are not finite (NaN or infinity)")
-    highest = float(part.colors.max())
-    white = full_scale(part.colors.dtype, highest, linear=highest < 2)
-    if white > 1:
-        ignored.add(f"vertex colours up to {highest:g} (taken as linear in 0..{white:g})")
-    elif part.colors.min() < 0 or highest > 1:
+    if part.colors.max() > 2:
+        raise UserError(f"has linear vertex colours up to {part.colors.max():g}; expected 0 to 1")
+    if part.colors.min() < 0 or part.colors.max() > 1:
         ignored.add("vertex colours outside [0, 1] (clipped)")
-    return np.clip(part.colors / white, 0, 1)
+    return np.clip(part.colors, 0, 1)
 
 
 def _identity(material: Material) -> tuple:

@@ -94,17 +94,12 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
 
 
 def _columns(text: Rests, loading: Loading) -> Columns:
-    """The columns of the vertices: positions, and colours where some row has them."""
+    """The columns of the vertices: positions, and colours where all rows have them."""
     try:
         table = _table(text["v"], None)
     except ValueError:  # rows of different lengths
         table = _table(text["v"], 3)
-        with_color = np.array([len(row.partition("#")[0].split()) >= 6 for row in text["v"]])
-        if with_color.any():
-            some = _table([row for row, has in zip(text["v"], with_color, strict=True) if has], 6)[:, 3:]
-            table = np.concatenate([table, np.broadcast_to(some.mean(axis=0), table.shape)], axis=1)
-            table[with_color, 3:] = some
-            loading.say(f"{np.sum(~with_color):,} of {len(table):,} vertices have no colour: the others' mean is taken")
+        loading.ignored.add("colours of some vertices alone")
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
     return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))

@@ -151,7 +151,9 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
 
 def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
     """Names of the columns of a table by a line before it that names x, else by the numbers."""
-    count, found, unfit = table.shape[1], [], []
+    count = table.shape[1]
+    found: list[list[str]] = []
+    unfit: list[list[str]] = []
     filled = 1 + int(
         np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2)
     )  # columns, up to the last with numbers
@@ -172,8 +174,8 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
     if unfit:
         raise UserError(f"names {len(unfit[0])} columns ({' '.join(unfit[0])}) above {count} columns of numbers")
     of_format = suffix == ".pts" and filled == 7
-    names = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
-    return (*names, *[INDEX] * (count - filled))
+    told = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
+    return (*told, *[INDEX] * (count - filled))
 
 
 def _split_names(header: str, mark: str) -> list[str]:

@@ -17,7 +17,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import SRGB_TABLE, Loading, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import open_text
-from spnr_jax.formats.row_files import Lists, read_elements, read_ply_header
+from spnr_jax.formats.row_files import Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
@@ -29,7 +29,7 @@ OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     """The part of a PLY file with faces, or strips of them."""
     file = io.BytesIO(path.read_bytes())
-    header = read_ply_header(file)
+    header = read_header(file, ".ply")
     if (element := header.faces) is None:
         return []
     (vertices, _), (of_faces, lists) = read_elements(file, header, "vertex", element).values()
@@ -90,11 +90,9 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
         held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
         if announced > held:
             raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
-        if not announced:
-            loading.say(f"the header announces 0 triangles, {held} stand behind it: these are drawn")
-        elif held > announced:
-            more = held - announced
-            loading.say(f"the header announces {announced} triangles, {more} more stand behind them and are not read")
+        if held > announced:
+            read = announced or held
+            loading.say(f"the header announces {announced} triangles, {held} stand behind it, {read} are read")
         rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
         corners = rows["corners"]
         loading.ignored |= {"STL attribute bytes"} if rows["attribute"].any() else set()

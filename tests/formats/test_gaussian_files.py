@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from support import chromium as chromium_of
 from support import splat_balls, three_js
-from support.point_clouds import BALL, LINEAR, packed_splats, write
 
 from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
@@ -67,13 +66,6 @@ def test_our_own_spz_files_and_those_of_version_2_are_read_and_others_are_named(
         path.write_bytes(gzip.compress(data))
         with pytest.raises(ValueError, match=reason):
             read_cloud(path)
-
-
-def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
-    content = packed_splats(BALL, 0x28AA3CFF)
-    cloud = read_cloud(write(tmp_path, "a.ply", content))
-    np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
-    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
 
 
 # In three.js

@@ -107,7 +107,7 @@ REFUSED = (
     (square(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
     (square(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
     (glass("textures/gone.png"), "missing: 'textures/gone.png'"),
-    *((glass(uri), "outside its own folder") for uri in OUTSIDE),
+    *((glass(uri), "names a file that is missing") for uri in OUTSIDE),
     (glass("broken.png"), "broken.png"),
     (glass(pbrMetallicRoughness={"roughnessFactor": [0.1, 0.2, 0.3]}), "roughness of shape (3,)"),
     (glass("a.ktx2"), "cannot be read: a.ktx2 (KTX2, which is not read: convert it to PNG"),

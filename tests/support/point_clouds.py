@@ -32,20 +32,6 @@ def ply_bytes(form: str, newline: str = "\n", rows=ROWS, properties=VERTEX, befo
     return head + camera.tobytes() + vertex.tobytes() + b"\x02\0\0\0\0\1\0\0\0"
 
 
-def packed_splats(points: np.ndarray, color: int) -> bytes:
-    """A compressed .ply of splats at points (n, 3) in [-1, 1], all of one colour 0xRRGGBBAA."""
-    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {-(-len(points) // 256)}\n"
-    head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
-    head += f"element vertex {len(points)}\n"
-    head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
-    share = np.round((points + 1) / 2 * [2047, 1023, 2047]).astype(np.uint32)
-    rows = np.zeros((len(points), 4), "<u4")
-    rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
-    rows[:, 3] = color
-    boxes = np.array(-(-len(points) // 256) * ([-1] * 3 + [1] * 3), "<f4")
-    return (head + "end_header\n").encode() + boxes.tobytes() + rows.tobytes()
-
-
 def sphere_points(seed: int, num_points: int) -> np.ndarray:
     """Points on a sphere, much denser at one pole."""
     points = np.random.default_rng(seed).normal(size=(num_points, 3)) + [0, 1.5, 0]
