@@ -32,36 +32,27 @@ POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
-AXES, CHANNELS = ("x y z", "0 1 2"), ("r g b", "red green blue", "0 1 2")
-# ours -> what the names of others, without separators, begin with, and how they end; the first that is there counts
-STEMS = {
-    POSITION: (" points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p", AXES),
-    LINEAR: ("basecolor albedo", CHANNELS),
-    SRGB: (" color colors rgb diffuse vertex", CHANNELS),
-    NORMAL: ("n normal normals", AXES),
+ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
+ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
+    ours: [[name.replace("_", "") for name in ours]]
+    + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
+    + [names.split() for names in others.split("|") if names]
+    for ours, stems, others in (
+        (
+            *(POSITION, "points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p"),
+            "xm ym zm|easting northing elevation|easting northing height|x y height|x y elevation",
+        ),
+        (LINEAR, "basecolor albedo", ""),
+        (SRGB, "color colors rgb diffuse vertex", "r g b|rf gf bf"),
+        (NORMAL, "n normal normals", ""),
+        (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
+        (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
+        (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
+        (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
+        *(((name,), "", "") for name in ("rgb", "rgba", "opacity", "classification", "withheld", "splat_opacity")),
+    )
 }
-ALIASES: dict[tuple[str, ...], list[list[str]]] = {
-    names: [
-        [stem + end for end in own.split()] for stem in stems.split(" ") for own in endings if stem or own != "0 1 2"
-    ]
-    for names, (stems, endings) in STEMS.items()
-}
-ALIASES[POSITION] += [["easting", "northing", height] for height in ("elevation", "height")] + [["xm", "ym", "zm"]]
-ALIASES[POSITION] += [["x", "y", height] for height in ("height", "elevation")]
-ALIASES[SRGB] += [["rf", "gf", "bf"]]
-ALIASES |= {
-    (name,): [[name], *([other] for other in others.split())]
-    for name, others in {
-        "roughness": "rough roughnessfactor pbrroughness",
-        "metallic": "metalness metallicfactor metal pbrmetallic",
-        "intensity": "reflectance reflectivity amplitude gray grey",
-        "alpha": "a diffusealpha colora rgb3 color3 colors3",
-        **dict.fromkeys(("rgb", "rgba", "opacity", "classification", "withheld"), ""),
-        "splat_opacity": "splatopacity",
-    }.items()
-}
-ARRAYS = {stem for stems, _ in STEMS.values() for stem in stems.split()}  # names of arrays of several columns
-ARRAYS |= {name for group in ALIASES.values() for names in group for name in names}
+ARRAYS = {name.removesuffix("0") for group in ALIASES.values() for names in group for name in names}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}

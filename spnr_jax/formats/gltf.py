@@ -180,8 +180,7 @@ class GltfFile:
         version = str(self.document.get("asset", {}).get("version", "1.0"))
         if not version.startswith("2."):
             raise UserError(f"is glTF {version}; only glTF 2.0 can be read: convert it")
-        self._buffers: dict[int, bytes] = {}
-        self._views: dict[int, memoryview] = {}
+        self.view, self._buffer = cache(self._read_view), cache(self._read_buffer)
         self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
 
     def columns(self, attributes: dict[str, int], *names: str) -> Columns:
@@ -214,27 +213,24 @@ class GltfFile:
             raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
         return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
 
-    def view(self, index: int) -> memoryview:
-        """What a buffer view holds."""
-        if index not in self._views:
-            view = self.document["bufferViews"][index]
-            packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
-            data = self._slice(packed or view)
-            self._views[index] = memoryview(unpack(data, packed)) if packed else data
-        return self._views[index]
-
-    def _slice(self, view: dict) -> memoryview:
-        start, length, number = view.get("byteOffset", 0), view["byteLength"], view["buffer"]
-        if number not in self._buffers:
-            uri = self.document["buffers"][number].get("uri")
-            data = self._binary if uri is None else self.loading.read(uri, needed=True)
-            if data is None:
-                raise UserError(f"buffer {number} has no data in the file")
-            self._buffers[number] = data
-        buffer, end = self._buffers[number], start + length
+    def _read_view(self, index: int) -> memoryview:
+        view = self.document["bufferViews"][index]
+        packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
+        place = packed or view
+        start, buffer = place.get("byteOffset", 0), self._buffer(place["buffer"])
+        end = start + place["byteLength"]
         if not 0 <= start <= end <= len(buffer):
+            number = place["buffer"]
             raise UserError(f"buffer {number} has {len(buffer)} bytes where {end} are needed: truncated file")
-        return memoryview(buffer)[start:end]
+        data = memoryview(buffer)[start:end]
+        return memoryview(unpack(data, packed)) if packed else data
+
+    def _read_buffer(self, number: int) -> bytes:
+        uri = self.document["buffers"][number].get("uri")
+        data = self._binary if uri is None else self.loading.read(uri, needed=True)
+        if data is None:
+            raise UserError(f"buffer {number} has no data in the file")
+        return data
 
     def unpack_mesh(self, primitive: dict) -> None:
         """Makes ready what a primitive keeps in a Draco mesh; whole numbers are as they were before, not normalised.

@@ -27,7 +27,7 @@ READERS: dict[str, Callable[[Path, Report], Iterator[Columns]]] = {
     **{kind: partial(row_pieces, kind=kind) for kind in (".ply", ".pcd")},
     **dict.fromkeys(TEXT, text_pieces),
     **dict.fromkeys((".npz", ".npy"), numpy_pieces),
-    **dict.fromkeys((".las", ".laz"), lambda path, _: las_pieces(path)),
+    **dict.fromkeys((".las", ".laz"), las_pieces),
     ".spz": lambda path, _: iter([spz_columns(path)]),
 }
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")

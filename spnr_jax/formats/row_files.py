@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns, Report, name_columns
+from spnr_jax.formats.columns import ARRAYS, Columns, Report, list_names, name_columns, plain_name
 from spnr_jax.formats.point_tables import load_text
 
 Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
@@ -173,7 +173,11 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
         if header.encoding == "binary_compressed":
             yield _packed_columns(file.read(), *header.elements)
             return
-        yield from (columns for _, columns, _ in element_pieces(file, header, "vertex"))
+        for _, columns, lists in element_pieces(file, header, "vertex"):
+            fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}
+            if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
+                raise UserError(f"has lists of several lengths: {list_names([*fields])}")
+            yield columns | name_columns({name: x.reshape(len(sizes), -1) for name, (sizes, x) in fields.items()})
         name, count, properties = header.elements[-1]
         held, begin = 0, file.tell()
         if name == "vertex" and header.encoding == "ascii":

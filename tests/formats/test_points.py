@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import re
 import struct
 import time
 import zipfile
@@ -19,6 +20,7 @@ from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.point_files import column_pieces, kind_of
 from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.formats.row_files import decompress
+from spnr_jax.surfels.sides import spiral
 
 PIECED = ("ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "a.xyz", "a.csv", "a.npy", "a.las")
 ANNOUNCED = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd npy npz las laz off glb"]
@@ -85,8 +87,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
 BACKWARDS = [row[::-1] for row in ROWS]
-WITH_INTENSITY, WITH_ALPHA = [(*row[:3], -900, *GREEN) for row in ROWS], [(*row, 255) for row in ROWS]
-BINARY = [(*row[:3], *(x / 255 for x in GREEN), i % 2) for i, row in enumerate(ROWS)]
+WITH_INTENSITY = [(*row[:3], -900, *GREEN) for row in ROWS]
 TIMED = [(17.5 + i / 1e3 + (i % 3) / 1e4, *row) for i, row in enumerate(ROWS)]
 LABELED = [(*row, i % 40) for i, row in enumerate(ROWS)]
 PARAVIEW = [(*GREEN, *row[:3]) for row in ROWS]
@@ -107,7 +108,6 @@ TEXTS = {
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
     "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
     "a number before each point": ("a.csv", table(",", columns=INDEXED)),
-    "a label behind the colour": ("a.txt", table(" ", columns=LABELED)),
     "a label, and a row of nan": ("a.txt", table(" ", columns=[*LABELED, 7 * (np.nan,)])),
     ".pts with an intensity like a colour": ("a.pts", table(" ", columns=[(*row[:3], 90, *GREEN) for row in ROWS])),
     "the last field not known": ("a.csv", "x,y,z,r,g,b,intensity\n" + table(",", ",")),
@@ -129,13 +129,11 @@ TEXTS = {
     "counts of points and columns": ("a.xyz", "420 6\n" + table(" ")),
     "units without brackets": ("a.csv", "x,y,z,r,g,b\nm,m,m,-,-,-\n" + table(",")),
     "names of other programs": ("a.csv", "POINT_X,Point-Y,point.z,Color.R,color_g,Color B\n" + table(",")),
-    "a label of 0 and 1 behind colours of 0 to 1": ("a.txt", table(" ", columns=BINARY)),
     "a time before each point": ("a.txt", table(" ", columns=TIMED)),
     "grey: normals and a label": ("a.txt", table(" ", columns=[(*p, *p, i % 9) for i, p in enumerate(POINTS)])),
     "grey: OFF and its counts in one word": ("a.off", "OFF420 0 0\n" + table(" ", columns=POINTS)),
     ".asc": ("a.asc", table(" ")),
     ".pts with intensity": ("a.pts", "420\n" + table(" ", columns=WITH_INTENSITY)),
-    "rows of red green blue alpha": ("a.txt", table(" ", columns=WITH_ALPHA)),
     "UTF-16, as Windows writes it": ("a.csv", ("x,y,z,r,g,b\n" + table(",")).encode("utf-16")),
     "every value in quotes": ("a.csv", '"x","y","z","r","g","b"\n"' + table('","', '"').replace("\n", '\n"')[:-1]),
     "a remark above": ("a.xyz", "% exported by hand\n" + table(" ")),
@@ -221,6 +219,46 @@ def test_columns_without_names_are_told_by_their_number_and_normals_by_their_len
     columns = read_columns(write(tmp_path, "a.xyz", "\n".join(" ".join(map(str, row)) for row in rows)))
     assert list(columns) == names.split()
     np.testing.assert_array_equal(np.stack(list(columns.values()), axis=-1), rows)
+
+
+SHADE = 0.5 + 0.4 * np.sin(3 * BALL[:, :1]) * np.cos(4 * BALL[:, 1:2])  # of a surface, as a camera sees it
+PHOTO = np.round(255 * SHADE * [0.9, 0.7, 0.5] + np.random.default_rng(0).uniform(0, 12, (420, 3)))
+VALUES = {  # of columns
+    "r g b": PHOTO,
+    "nx ny nz": spiral(420),
+    "intensity": np.random.default_rng(1).integers(0, 100, 420) + 0.25,
+    "whole intensity": np.random.default_rng(1).integers(0, 256, 420),
+    "label": np.arange(420) % 13,
+    "flag": np.arange(420) % 2,
+    "roughness": SHADE,
+    "metallic": np.arange(420) % 2,
+    "alpha": np.full(420, 255),
+}
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        *("intensity, r g b", "whole intensity, r g b", "r g b, label", "r g b, whole intensity", "r g b, alpha"),
+        *("r g b, flag, label", "r g b, roughness, metallic", "r g b, nx ny nz, label", "intensity, r g b, label"),
+    ],
+)
+def test_columns_without_names_are_told_by_their_values(tmp_path, columns):
+    values = np.column_stack([BALL, *(VALUES[name] for name in columns.split(", "))])
+    np.savetxt(tmp_path / "a.txt", values, fmt="%.6g")
+    expected = columns.replace("whole intensity", "intensity").replace("label", "scalar").replace("flag", "scalar")
+    expected = re.sub("(?<=b, )intensity", "scalar", expected).replace(",", "")
+    assert f"taken as x y z {expected}" in " ".join(read(tmp_path / "a.txt")[1])
+
+
+def test_normals_of_a_level_plane_are_no_colours(tmp_path):
+    rows = [(x, y, 5, 0, 0, 1) for x in range(20) for y in range(20)]
+    assert (read_cloud(write(tmp_path, "a.xyz", table(" ", columns=rows))).normals == [0, 0, 1]).all()
+
+
+def test_decimal_commas_in_quotes_separate_nothing(tmp_path):
+    rows = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
+    np.testing.assert_allclose(read_cloud(write(tmp_path, "a.csv", rows)).positions, BALL, atol=1e-5)
 
 
 # Packed PCD
@@ -313,6 +351,17 @@ def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffi
         read_cloud(tmp_path / f"a{suffix}")
 
 
+@pytest.mark.parametrize("kind", [6, 7])
+def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, kind):
+    as_scan(tmp_path / "a.las", WHOLE, kind)
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    for count, announced in (("<Q", 247), ("<I", 107)):
+        struct.pack_into(count, content, announced, 7)
+    cloud, lines = read(write(tmp_path, "a.las", bytes(content)))
+    assert len(cloud.positions) == 7
+    assert "at least 5 points stand behind those that the header announces and are not read" in lines
+
+
 # What is refused
 
 
@@ -381,7 +430,7 @@ REFUSED = [
     ("a.ply", PLY + b"element vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
     ("a.ply", PLY + b"element edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
     ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
-    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found none"),
+    ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found x"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
