@@ -240,7 +240,7 @@ VALUES = {  # of columns
     "columns",
     [
         *("intensity, r g b", "whole intensity, r g b", "r g b, label", "r g b, whole intensity", "r g b, alpha"),
-        *("r g b, flag, label", "r g b, roughness, metallic", "r g b, nx ny nz, label", "intensity, r g b, label"),
+        *("r g b, flag, flag", "r g b, roughness, metallic", "r g b, nx ny nz, label", "intensity, r g b, label"),
     ],
 )
 def test_columns_without_names_are_told_by_their_values(tmp_path, columns):
