@@ -91,7 +91,7 @@ def plain_name(name: str) -> str:
 
 def rename(columns: Columns) -> Columns:
     """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
-    plain = {plain_name(name): x for name, x in columns.items()}
+    plain = {plain_name(name): x for name, x in columns.items()} | columns
     found: Columns = {}
     for ours, theirs in ALIASES.items():
         names = next((names for names in theirs if set(names) <= plain.keys()), [])
@@ -274,10 +274,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
         lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
     values = np.clip(values, 0, 1)
-    brightness = values.max(axis=-1)
-    dark = {"0": np.mean(brightness == 0), "nearly black": np.mean(brightness < DARK)}
-    if word := next((word for word, share in dark.items() if len(values) >= LEAST and share > MOSTLY), None):
-        lines.append(f"{dark[word]:.0%} of {name} are {word}: the picture will be black")
+    if len(values) >= LEAST and (share := np.mean(values.max(axis=-1) < DARK)) > MOSTLY:
+        lines.append(f"{share:.0%} of {name} are nearly black: the picture will be black")
     return values if linear else srgb_to_linear(values), lines
 
 

@@ -57,6 +57,8 @@ def load_mesh(
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
         parts = READERS[kind](path, loading)
+        for part in parts:
+            _check_columns(part)
         if loading.strict or not parts or any(len(part.faces) for part in parts):
             parts = assemble(parts, loading)
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
@@ -68,8 +70,6 @@ def assemble(parts: list[Part], loading: Loading) -> list[Part]:
     """The parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     if not parts:
         raise UserError(f"has nothing to draw: {'; '.join(notes)}" if (notes := loading.notes()) else "has no faces")
-    for part in parts:
-        _check_columns(part)
     parts = parts if loading.strict else _without_false_normals(_finite(parts, loading), loading)
     low, high = bounding_box(Asset(parts=tuple(parts)))
     smallest, degenerate = DEGENERATE_AREA * np.sum((high - low) ** 2), 0
