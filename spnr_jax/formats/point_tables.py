@@ -21,7 +21,6 @@ import contextlib
 import io
 import re
 import threading
-import warnings
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
@@ -158,16 +157,16 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
         np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2)
     )  # columns, up to the last with numbers
     for line in reversed(before):
-        text = line.lstrip("#/%")
-        marks = [mark for mark in ";," if mark in UNITS.sub("", text)]
-        for names in (_split_names(text, mark) for mark in (*marks, r"[\s,;]+")):
-            if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
-                names.insert(0, "")  # as R writes a table
-            while len(names) > filled and not names[-1]:
-                names.pop()
-            fits, plain = filled <= len(names) <= count, text == line and not NUMBER.match(text)
-            if "x" in names or (plain and fits):
-                (found if fits else unfit if plain else []).append(names)
+        text = UNITS.sub("", line.lstrip("#/% "))
+        mark = next((mark for mark in ";," if mark in text), None)
+        names = [name.strip("' \t").lower() for name in text.split(mark)]
+        if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
+            names.insert(0, "")  # as R writes a table
+        while len(names) > filled and not names[-1]:
+            names.pop()
+        fits, plain = filled <= len(names) <= count, not line.startswith(COMMENTS) and not NUMBER.match(line)
+        if "x" in names or (plain and fits):
+            (found if fits else unfit if plain else []).append(names)
     if names := next((names for names in found if "x" in names), [*found, []][0]):
         names += [""] * (count - len(names))  # separators behind the last number
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
@@ -176,11 +175,6 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
     of_format = suffix == ".pts" and filled == 7
     told = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
     return (*told, *[INDEX] * (count - filled))
-
-
-def _split_names(header: str, mark: str) -> list[str]:
-    """The names in a header, in small letters, without units."""
-    return [name.strip("\"' \t").lower() for name in re.split(mark, UNITS.sub("", header).strip())]
 
 
 def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
@@ -257,7 +251,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
     advice = "save arrays, as np.savez(file, points=..., colors=...)"
-    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), _parsing():
+    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), PARSER:
         rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
@@ -286,7 +280,7 @@ def read_arrays(
 
     `report` gets a line about the others.
     """
-    with refusing("is a broken or truncated NumPy file"), _parsing(), np.load(file, allow_pickle=False) as archive:
+    with refusing("is a broken or truncated NumPy file"), PARSER, np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
         if (unpacked := sum(sizes[name] for name in names)) > MOST_BYTES:
@@ -300,14 +294,6 @@ def read_arrays(
     if not arrays:
         raise UserError(f"has none of the arrays {list_names([*(wanted or ())])}; found {', '.join(sizes) or 'none'}")
     return arrays
-
-
-@contextlib.contextmanager
-def _parsing() -> Iterator[None]:
-    """Headers are read by one thread at a time; NumPy warns of those of Python 2, which it reads well."""
-    with PARSER, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
-        yield
 
 
 def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:

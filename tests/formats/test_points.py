@@ -68,12 +68,6 @@ def test_what_says_how_much_it_holds_is_refused_wherever_it_is_cut(tmp_path, nam
         assert "\n" not in str(refused.value)
 
 
-def test_arrays_of_python_2_are_read_without_a_warning(tmp_path):
-    old = as_npy(WHOLE.positions).replace(b"(12, 3), } ", b"(12L, 3), }")
-    for name, data in (("a.npy", old), ("a.npz", archive(old))):
-        np.testing.assert_array_equal(read_cloud(write(tmp_path, name, data)).positions, WHOLE.positions)
-
-
 # Text
 
 
