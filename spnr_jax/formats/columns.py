@@ -274,7 +274,7 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
         lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
     values = np.clip(values, 0, 1)
-    if len(values) >= LEAST and (share := np.mean(values.max(axis=-1) < DARK)) > MOSTLY:
+    if not linear and len(values) >= LEAST and (share := np.mean(values.max(axis=-1) < DARK)) > MOSTLY:
         lines.append(f"{share:.0%} of {name} are nearly black: the picture will be black")
     return values if linear else srgb_to_linear(values), lines
 

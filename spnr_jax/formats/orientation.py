@@ -6,8 +6,8 @@ of them.  The base at an end is the convex hull of the points within BASE of it,
 seen along the axis.  Of 78 real objects 69 are found upright as they are (y up) and 61 turned to z up; where it fails,
 say which axis (`--up`).
 
-PCD headers name the place of a sensor.  Every point was seen from there, so that its normal points to it; and a depth
-camera's own axes say which way is up.  The place 0 0 0 that writers of PCD put there for want of a
+PCD headers and PLY camera elements name the place of a sensor.  Every point was seen from there, so that its normal
+points to it; and a camera's own axes say which way is up.  The place 0 0 0 that writers of PCD put there for want of a
 better one is believed if nothing hides the points from it, another place if it sees most of them.
 """
 
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from spnr_jax.formats.row_files import read_header
+from spnr_jax.formats.row_files import element_pieces, read_header
 from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
@@ -38,6 +38,7 @@ MOST = 0.7  # share of the points that must be seen from a place that a file nam
 OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
 BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
 FARTHEST = 1e30  # units, beyond which no sensor and no point lies: galaxies are 1e21 metres wide
+PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
 def find_up(positions: np.ndarray, kind: str) -> tuple[str, str]:
@@ -77,6 +78,8 @@ class Sensor(NamedTuple):
 
 def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
     """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
+    if kind == ".ply":
+        return _camera_of(path)
     if kind != ".pcd":
         return None
     with path.open("rb") as file:
@@ -94,6 +97,21 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
             return Sensor(place)
         report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
     return None
+
+
+def _camera_of(path: Path) -> Sensor | None:
+    """The camera that a PLY file begins with."""
+    with path.open("rb") as file:
+        header = read_header(file, ".ply")
+        if [name for name, _, _ in header.elements][:1] != ["camera"]:
+            return None
+        _, columns, _ = next(element_pieces(file, header, "camera"))
+    place, above = (np.array([columns.get(name, [np.nan])[0] for name in names], float) for names in (PLACE, UP))
+    if not (np.abs(place) < FARTHEST).all():
+        return None
+    if not (np.isfinite(above).all() and above.any()):
+        return Sensor(place)
+    return Sensor(place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)))
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:

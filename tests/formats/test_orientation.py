@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from support.point_clouds import ply_bytes
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of, standing
 from spnr_jax.surfels.sides import spiral
+
+AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
 
 
 def pcd(folder, points: np.ndarray, height: int = 1, viewpoint: str = "0 0 0 1 0 0 0"):
@@ -14,6 +17,19 @@ def pcd(folder, points: np.ndarray, height: int = 1, viewpoint: str = "0 0 0 1 0
     head += f"HEIGHT {height}\nVIEWPOINT {viewpoint}\nPOINTS {len(points)}\nDATA binary\n"
     (folder / "a.pcd").write_bytes(head.encode() + points.astype("<f8").tobytes())
     return folder / "a.pcd"
+
+
+def ply(folder, form: str, camera: list[float], names=AXES):
+    """A PLY file of a ball behind a camera."""
+    rows = [tuple(point) for point in spiral(300).tolist()]
+    content = ply_bytes(form, rows=rows, properties=[(axis, "double") for axis in "xyz"], before=0)
+    lines = "element camera 1\n" + "".join(f"property float {name}\n" for name in names)
+    text = " ".join(map(str, camera)).encode() + b"\n"
+    data = text if form == "ascii" else np.array(camera, "<f4" if "little" in form else ">f4").tobytes()
+    head, body = content.split(b"end_header\n", 1)
+    head = head.replace(b"element camera 0\nproperty float f\nproperty int id\n", lines.encode())
+    (folder / "a.ply").write_bytes(head + b"end_header\n" + data + body)
+    return folder / "a.ply"
 
 
 def half_ball(away: float) -> np.ndarray:
@@ -49,6 +65,14 @@ def test_the_viewpoint_that_every_writer_puts_there_is_believed_if_nothing_hides
     assert lines == ["the place of the sensor left out: from 0 0 9 few points are seen"]
     for viewpoint in ("nan 0 0 1 0 0 0", "1e300 0 0 1 0 0 0", "x y z", ""):
         assert sensor(pcd(tmp_path, seen, viewpoint=viewpoint)) is None
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_the_camera_of_a_ply_file_gives_the_sides_of_the_points_and_the_way_up(tmp_path, form):
+    placed = place_cloud(ply(tmp_path, form, [0, 0, 0, 0.1, -0.9, 0.2]))
+    assert placed.up == "-y"
+    normals = placed.cloud.normals @ placed.rotation
+    np.testing.assert_allclose(normals, -spiral(300), atol=0.1)  # seen from within
 
 
 def table() -> np.ndarray:
