@@ -38,7 +38,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         raise UserError("has no faces, and no vertices")
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
-    columns = _columns(text, loading)
+    columns = _columns(text)
     colors, notes = colors_of(columns) or (None, [])
     loading.say(*notes)
     if not text["f sizes"]:
@@ -93,13 +93,9 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
     return np.loadtxt(rows, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
 
 
-def _columns(text: Rests, loading: Loading) -> Columns:
-    """The columns of the vertices: positions, and colours where all rows have them."""
-    try:
-        table = _table(text["v"], None)
-    except ValueError:  # rows of different lengths
-        table = _table(text["v"], 3)
-        loading.ignored.add("colours of some vertices alone")
+def _columns(text: Rests) -> Columns:
+    """The columns of the vertices: positions, and perhaps colours."""
+    table = _table(text["v"], None)
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
     return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))

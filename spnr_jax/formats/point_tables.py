@@ -160,8 +160,6 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
         text = UNITS.sub("", line.lstrip("#/% "))
         mark = next((mark for mark in ";," if mark in text), None)
         names = [name.strip("' \t").lower() for name in text.split(mark)]
-        if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
-            names.insert(0, "")  # as R writes a table
         while len(names) > filled and not names[-1]:
             names.pop()
         fits, plain = filled <= len(names) <= count, not line.startswith(COMMENTS) and not NUMBER.match(line)

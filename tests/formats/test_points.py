@@ -110,7 +110,6 @@ TEXTS = {
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
     "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
     "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
-    "R's index": ("a.txt", "x y z r g b\n" + table(" ", columns=INDEXED)),
     "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
     "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
     "trailing semicolons": ("a.txt", table(";", ";")),
