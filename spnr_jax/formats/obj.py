@@ -47,10 +47,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         none = np.zeros((0, 3), np.int64)
         return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
-    for names in map(str.strip, text["mtllib"]):  # one name with spaces, or several without
-        single = (loading.folder / names).is_file() or len(names.split()) == 1
-        for name in [names] if single else names.split():
-            library |= parse_mtl(loading.read(name) or b"")
+    for name in text["mtllib"]:
+        library |= parse_mtl(loading.read(name.strip()) or b"")
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text["usemtl"]):
         looks[name] = make_material() if not name else _look(name, library.get(name), loading)

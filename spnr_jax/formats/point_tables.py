@@ -228,6 +228,7 @@ def _are_colors(values: np.ndarray) -> bool:
     return bool(values.min() >= 0 and highest.min() >= highest.max() / 16 and (whole or highest.max() <= 1))
 
 
+@np.errstate(invalid="ignore")  # of a constant column
 def _likeness(values: np.ndarray) -> float:
     """The smaller correlation of neighbouring columns of three (n, 3); 0 where one is constant."""
     correlation = np.abs(np.corrcoef(values.T))
