@@ -209,7 +209,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
             names[-2:] = "roughness", "metallic"
     if names[3:4] == ["scalar"]:
         names[3] = "intensity"
-    if count > 6:
+    if count > 3:
         report(f"the {count} columns, which have no names, taken as {' '.join(names)}")
     return tuple(names)
 

@@ -224,7 +224,7 @@ def test_columns_without_names_are_told_by_their_values(tmp_path, columns):
     assert list(found) == list(dict.fromkeys(names))
     for name, column in dict(zip(names, values.T, strict=True)).items():
         np.testing.assert_array_equal(found[name], column)
-    assert any(f"taken as {' '.join(names)}" in line for line in read(tmp_path / "a.txt")[1]) == (len(names) > 6)
+    assert any(f"taken as {' '.join(names)}" in line for line in read(tmp_path / "a.txt")[1]) == (len(names) > 3)
 
 
 def test_normals_of_a_level_plane_are_no_colours(tmp_path):
