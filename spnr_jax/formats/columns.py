@@ -40,7 +40,7 @@ ALIASES = {  # ours -> what stands for it, without separators; the first group t
     for ours, stems, others in (
         (
             *(POSITION, "points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p"),
-            "xm ym zm|easting northing elevation|easting northing height|x y height|x y elevation",
+            "xm ym zm|xcoord ycoord zcoord|easting northing elevation|easting northing height|x y height|x y elevation",
         ),
         (LINEAR, "basecolor albedo", ""),
         (SRGB, "color colors rgb diffuse vertex", "r g b|rf gf bf"),
@@ -73,14 +73,11 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
     So ParaView names them; fields of more numbers are none.
     """
     columns: Columns = {}
-    for name, values in (
-        (name.lower(), x) for name, x in fields.items() if x.dtype.kind in "fiub" and x.ndim in (1, 2)
-    ):
-        width = values.size // len(values) if values.ndim == 2 and len(values) else 1
-        if width < 2:
-            columns[name] = values.reshape(-1)
-        elif width < 5:
-            columns |= {f"{name}:{i}": values[:, i] for i in range(width)}
+    for name, values in fields.items():
+        width = values.shape[1] if values.ndim == 2 else 1
+        if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
+            several = {f"{name.lower()}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
+            columns |= several or {name.lower(): values.reshape(-1)}
     return columns
 
 

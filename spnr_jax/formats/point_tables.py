@@ -1,16 +1,12 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
 Numbers of text are separated by commas, semicolons or blanks, also behind the last one; a decimal comma is told by that
-nothing else separates there.  Lines of one whole number count the points.  A header line names the columns, also behind
-#, % or //, with units in brackets; a column without a name is a table's index.  Without a header the number of columns
-tells, behind one that only counts, and for normals and colours their values:
+nothing else separates there, or by quotes.  Lines of one whole number count the points.  A header line names the
+columns, also behind #, % or //, with units in brackets; a column without a name is a table's index.  Without a header
+the values tell what stands behind x y z: normals, r g b, alpha, roughness, metallic, intensity, or any other number.
 
-    3 x y z | 4 + intensity | 6 + r g b, or + nx ny nz if these have length 1 | 7 + r g b alpha, r g b and any number,
-    or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
-    9 + r g b and nx ny nz in either order
-
-    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name,
-            those that look like colours or normals; they come whole where they are compressed
+    .npz    arrays (points, c) or (points,), whose names are those of columns; of the points as in text without a
+            header, also of arrays without names; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
@@ -150,26 +146,25 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
 
 def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
     """Names of the columns of a table by a line before it that names x, else by the numbers."""
-    count = table.shape[1]
+    count, filled = table.shape[1], 1 + int(np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2))
     found: list[list[str]] = []
-    unfit: list[list[str]] = []
-    filled = 1 + int(
-        np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2)
-    )  # columns, up to the last with numbers
+    unfit: list[str] = []
     for line in reversed(before):
         text = UNITS.sub("", line.lstrip("#/% "))
         mark = next((mark for mark in ";," if mark in text), None)
         names = [name.strip("' \t").lower() for name in text.split(mark)]
         while len(names) > filled and not names[-1]:
             names.pop()
-        fits, plain = filled <= len(names) <= count, not line.startswith(COMMENTS) and not NUMBER.match(line)
-        if "x" in names or (plain and fits):
-            (found if fits else unfit if plain else []).append(names)
+        is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
+        if filled <= len(names) <= count and ("x" in names or not is_remark):
+            found.append(names)
+        elif "x" in names and not is_remark:
+            unfit = unfit or names
     if names := next((names for names in found if "x" in names), [*found, []][0]):
         names += [""] * (count - len(names))  # separators behind the last number
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
     if unfit:
-        raise UserError(f"names {len(unfit[0])} columns ({' '.join(unfit[0])}) above {count} columns of numbers")
+        raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers")
     of_format = suffix == ".pts" and filled == 7
     told = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
     return (*told, *[INDEX] * (count - filled))
