@@ -210,12 +210,11 @@ class Loading:
 def _find(folder: Path, names: list[str]) -> Path | None:
     """The file at names, in any letter case, below a folder; the very names are preferred."""
     for name in names:
-        if not folder.is_dir():
+        if name == ".." or ":" in name or not folder.is_dir():
             return None
-        inside = sorted(path for path in folder.iterdir() if path.name.casefold() == name.casefold())
-        if not inside:
-            return None
-        folder = next((path for path in inside if path.name == name), inside[0])
+        exact = folder / name
+        alike = [] if exact.exists() else sorted(x for x in folder.iterdir() if x.name.casefold() == name.casefold())
+        folder = next(iter(alike), exact)
     return folder if folder.is_file() else None
 
 
