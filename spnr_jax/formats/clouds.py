@@ -254,8 +254,6 @@ def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:
 def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.ndarray]:
     """Points spread over the surface of a mesh, less an origin (3,) where float32 is too coarse for them."""
     corners, report = np.stack(bounding_box(asset)), how.report
-    if np.abs(corners).max() > np.finfo(np.float32).max:
-        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
     # walls and floors have few values by themselves, so only where six digits are too few
     _check_rounding(vertices, np.abs(corners).max(axis=0) > SIX_DIGITS * np.ptp(corners, axis=0), report)
