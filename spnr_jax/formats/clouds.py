@@ -47,6 +47,7 @@ from spnr_jax.kernels.cloud_arrays import (
     THINNING,
     farthest_points,
     inner_box,
+    measure_spacing,
     merge_repeats,
     require_surface,
     sample_stream,
@@ -65,6 +66,7 @@ TEXT_MESHES = (".obj", ".off")  # which write numbers of any length
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
+LOST_STEP = 1e-3  # of the extent of an axis, from which on it is said that the file rounded it
 MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis, at which six digits leave a hundred values at most
@@ -75,6 +77,7 @@ LEAST_POINTS = 100  # that tell normals, and what has no colour
 AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
 PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
 DEGREES, NEEDLE = 0.5, 100.0  # widest place in degrees; height over the width from which on degrees are suspected
+THIN = 0.1, 1.0  # spacings between which a plate is thick whose sides cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +354,7 @@ def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> 
 
 
 def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
-    """A line where x and y are degrees; ValueError where the file's columns round so coarsely that no shape is left."""
+    """A line where the file's columns round an axis coarsely or are degrees; ValueError where no shape is left."""
     low, high = inner_box(positions)
     x, y, z = extent = high - low
     farthest = np.maximum(np.abs(low), np.abs(high))
@@ -362,6 +365,9 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
     if steps.max() > MOST_LOST * extent.max() > 0:
         found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
+    for axis, step, width, column in zip("xyz", steps, extent, positions.T, strict=True):
+        if step > LOST_STEP * width > 0:
+            report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
     on_earth = farthest[:2].min() <= 90 and farthest[:2].max() <= 180
     if on_earth and 0 < max(x, y) < DEGREES and z > NEEDLE * max(x, y):
         size = f"{max(x, y):.2g} wide and {z:.3g} high"
@@ -381,6 +387,9 @@ def _check_values(points: Points, report: Report) -> None:
             near = cKDTree(positions[~black]).query(positions[black], 3)[1]
             values["base_color"] = values["base_color"].copy()
             values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
+    thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / measure_spacing(tree)
+    if THIN[0] < thickness < THIN[1]:
+        report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
     if "normals" in values and (reason := _doubt(positions, values["normals"])):
         report(f"normals of the file left out: {reason}")
         del values["normals"]

@@ -263,13 +263,20 @@ ROUNDED, LEFT_OUT = (
     np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]]),
     "normals of the file left out: ",
 )
+FLAT, SHORT = BALL * [50, 0.05, 50] + [0, 3e3, 0], r"only \d+ distinct values along y: the file's numbers are 0\.0002"
+PLATE = np.random.default_rng(0).uniform(-1, 1, (420, 3))
 ACROSS = spiral(420)[:, [1, 2, 0]] * [1, -1, 1]
 SAID = {  # positions and perhaps normals, what a line about them says
     "degrees": (BALL * [5e-5, 5e-5, 8] + [8.5, 47.1, 400], "x and y look like degrees"),
     "a handful": (BALL[:5], "5 points alone tell next to no surface"),
     "many more": (BALL[:50], None),
     "rounded": (ROUNDED, "only 7 distinct values along y, 414 along another axis: is it rounded?"),
+    "short floats": (FLAT.astype("f4"), SHORT),
+    "short floats on a map": ((200 * BALL + UTM).astype("f4"), r"only \d+ distinct values along y: .* are 0\.5 apart"),
     "short floats of a large ball": ((BALL + [0, 3e3, 0]).astype("f4"), None),
+    "thin plate": (PLATE * [1, 1, 0.02], "the points lie in a plate 0.[34]\\d spacings thick: if both sides"),
+    "thicker plate": (PLATE * [1, 1, 0.2], None),
+    "plane": (PLATE * [1, 1, 0], None),
     "one normal": (np.column_stack([BALL, np.tile([0.0, 0, -1], (420, 1))]), f"{LEFT_OUT}all are the same"),
     "normals across": (np.column_stack([BALL, ACROSS]), f"{LEFT_OUT}they lie across the surface"),
     "normals outwards": (np.column_stack([BALL, spiral(420)]), None),
