@@ -49,32 +49,38 @@ TEXTS = (
     (BLANK + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", (".obj",)),
     (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
 )
-# what to do with files of other kinds -> their suffixes and first bytes
-FOREIGN: dict[str, tuple[str, tuple[bytes, ...]]] = {
-    "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)": (
-        *(".usd .usda .usdc .usdz .fbx .dae .3ds .3mf .blend .x3d .wrl", (b"PXR-USDC", b"#usda", b"Kaydara FBX")),
-    ),
-    "convert it to .las or .ply, e.g. with CloudCompare (File > Save)": (".e57 .ptx .rcp .rcs .fls", (b"ASTM-E57",)),
-    "convert it to .ply, e.g. with ParaView (File > Save Data)": (".vtk .vtp .vtu", (b"# vtk",)),
-    "convert it to .ply with `colmap model_converter --output_type PLY`": ("", (b"# 3D point list",)),
-    "convert it to .ply with `draco_decoder -i a.drc -o a.ply`": (".drc", (b"DRACO",)),
-    "convert it to .ply with SuperSplat": (".splat .ksplat .sog", ()),
-    "convert it with `gdal_translate -of XYZ`": ("", (b"ncols",)),
-    "save its points in Python with np.savez(file, points=..., colors=...)": (
-        *(".bin .pt .pth .pkl .h5 .hdf5 .mat .parquet", ()),
-    ),
-    "save it as .csv": (".xlsx", ()),
-    "fetch it with `git lfs pull`": ("", (b"version https://git-lfs",)),
-    "download the file itself, not a page": ("", (b"<!doctype html", b"<!DOCTYPE html", b"<html")),
-    "give points or a mesh": ("", (b"\x89PNG", b"\xff\xd8\xff", b"%PDF")),
-    "unpack it first": (".gz .zip .7z .rar .bz2 .xz", (b"\x1f\x8b", b"PK\3\4")),
-}
+BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
+CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
+ARRAYS = "save its points in Python with np.savez(file, points=..., colors=...)"
+# what is not read: its name if not that of the suffix, suffixes, how it begins (groups: its version), how to convert it
+FOREIGN = (
+    ("USD (binary crate)", "", rb"PXR-USDC(.)(.)(.)", BLENDER),
+    ("USD (text)", "", rb"#usda ([\d.]+)", BLENDER),
+    ("USD (package)", ".usdz", b"", BLENDER),
+    ("FBX", ".fbx", rb"Kaydara FBX Binary..\0\x1a\0(.{4})|; FBX ([\d.]+)", BLENDER),
+    ("VRML", ".wrl", rb"#VRML V([\d.]+)", BLENDER),
+    ("COLLADA", ".dae", rb"<.{,400}<COLLADA\s[^>]*version=\"([\d.]+)", BLENDER),
+    ("", ".usd .usda .usdc .3ds .3mf .blend .x3d", b"", BLENDER),
+    ("E57", ".e57", rb"ASTM-E57(.{4})(.{4})", CLOUDCOMPARE),
+    ("", ".ptx .rcp .rcs .fls", b"", CLOUDCOMPARE),
+    ("VTK", ".vtk .vtp .vtu", rb"# vtk DataFile Version ([\d.]+)", "convert it to .ply, e.g. with ParaView"),
+    ("COLMAP's points", "", rb"# 3D point list", "convert it to .ply with `colmap model_converter --output_type PLY`"),
+    ("Draco", ".drc", rb"DRACO(.)(.)", "convert it to .ply with `draco_decoder -i a.drc -o a.ply`"),
+    ("", ".splat .ksplat .sog", b"", "convert it to .ply with SuperSplat"),
+    ("a grid of heights (ESRI ASCII)", "", rb"ncols", "convert it with `gdal_translate -of XYZ`"),
+    ("", ".bin .pt .pth .pkl .h5 .hdf5 .mat .parquet", b"", ARRAYS),
+    ("", ".xlsx", b"", "save it as .csv"),
+    ("a pointer to a file of Git LFS", "", rb"version https://git-lfs", "fetch it with `git lfs pull`"),
+    ("a web page", "", rb"(?i:<(?:!doctype )?html)", "download the file itself"),
+    ("a picture or document", "", rb"\x89PNG|\xff\xd8\xff|%PDF", "give points or a mesh"),
+    ("an archive", ".gz .zip .7z .rar .bz2 .xz", rb"\x1f\x8b|PK\x03\x04", "unpack it first"),
+)
 
 
 def kind_of(path: Path) -> str:
     """The suffix that names how a file is read, by its first bytes, else its name; ValueError for what cannot be read.
 
-    The error says how to convert it.
+    The error names the format, its version and how to convert it.
     """
     suffix, known = path.suffix.lower(), f"one of {' '.join(KNOWN)}"
     if path.is_dir():
@@ -90,11 +96,13 @@ def kind_of(path: Path) -> str:
     text = head.decode(encoding_of(head), "ignore").encode()
     if kind := _told_kind(MAGIC, head.removeprefix(BOM_UTF8), suffix):
         return kind
-    for advice, (suffixes, signs) in FOREIGN.items():
-        if suffix in suffixes.split():
-            raise UserError(f"{path}: a {suffix} file, which is not read: {advice}")
-        if head.startswith(signs):
-            raise UserError(f"{path}: begins with {head[:16]!r}, which is not read: {advice}")
+    for name, suffixes, sign, advice in FOREIGN:
+        begin = re.match(sign, head, re.DOTALL) if sign else None
+        if begin or suffix in suffixes.split():
+            found = [x for x in begin.groups() if x] if begin else []
+            words = [x.decode() if re.fullmatch(rb"[\d.]+", x) else str(int.from_bytes(x, "little")) for x in found]
+            of_version = f" of version {'.'.join(words)}" if words else ""
+            raise UserError(f"{path}: {name or f'a {suffix} file'}{of_version}, which is not read: {advice}")
     kind = _told_kind(TEXTS, text, suffix) or suffix
     if kind not in KNOWN:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected {known}")
