@@ -1,10 +1,13 @@
-"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read.
+"""Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read; compressed .ply, read.
 
     .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
             function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
     .spz    gzip; a header of 16 bytes, then all places (24-bit fixed point an axis), all opacities (8 bits), colours,
             logarithms of scales, rotations (32 bits), harmonics; axes right, up, back.  Versions 2 and 3 are read
-Both say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
+    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats, which store their place in it as 11, 10
+            and 11 bits, and their colour and opacity as 8 bits each
+
+The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
 with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light, becomes a
 comment of the .ply; a .spz has no place for one.  What is read are coloured points; `splat_opacity` is 0 to 1.
 """
@@ -33,6 +36,11 @@ SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm o
 HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
 PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
 MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
+CHUNK = 256  # splats
+PACKED_BITS = {  # of a compressed .ply: the property, and the place and number of its bits
+    **{"x": ("packed_position", 21, 11), "y": ("packed_position", 11, 10), "z": ("packed_position", 0, 11)},
+    **{name: ("packed_color", 24 - 8 * i, 8) for i, name in enumerate((*SRGB, "splat_opacity"))},
+}
 COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
@@ -144,3 +152,18 @@ def spz_columns(path: Path) -> Columns:
     colors = (octets[10 * count :].reshape(count, 3) / 255 - 0.5) / COLOR_STEP * C0 + 0.5
     columns = np.concatenate([fixed * 0.5**bits, np.clip(colors, 0, 1), octets[9 * count : 10 * count, None] / 255], 1)
     return dict(zip((*"xyz", *SRGB, "splat_opacity"), columns.T, strict=True))
+
+
+def unpack_columns(chunks: Columns, packed: Columns) -> Columns:
+    """The columns of a compressed .ply from its elements `chunk` and `vertex`."""
+    columns = {}
+    with refusing("is a broken file of compressed splats"):
+        for name, (source, shift, size) in PACKED_BITS.items():
+            columns[name] = (np.asarray(packed[source], np.uint32) >> shift & 2**size - 1) / (2**size - 1)
+            if size > 8 or f"min_{name[0]}" in chunks:
+                chunk = np.arange(len(columns[name])) // CHUNK
+                low, high = (np.asarray(chunks[f"{end}_{name[0]}"], np.float64)[chunk] for end in ("min", "max"))
+                columns[name] = low + columns[name] * (high - low)
+            if size == 8:
+                columns[name] = np.clip(columns[name], 0, 1)
+    return columns

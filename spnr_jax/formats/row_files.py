@@ -25,6 +25,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import ARRAYS, Columns, Report, list_names, name_columns, plain_name
+from spnr_jax.formats.gaussian_files import unpack_columns
 from spnr_jax.formats.point_tables import load_text
 
 Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
@@ -167,11 +168,18 @@ def read_header(file: BufferedIOBase, kind: str) -> Header:
 
 
 def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
-    """The columns of the points of a .ply or .pcd file, some at a time; a line about rows behind those announced."""
+    """The columns of the points of a .ply or .pcd file, some at a time; a line about rows behind those announced.
+
+    Compressed splats come whole.
+    """
     with path.open("rb") as file:
         header = read_header(file, kind)
         if header.encoding == "binary_compressed":
             yield _packed_columns(file.read(), *header.elements)
+            return
+        if any(field == "packed_position" for *_, properties in header.elements for field, *_ in properties):
+            found = read_elements(file, header, "chunk", "vertex")
+            yield unpack_columns(found["chunk"][0], found["vertex"][0])
             return
         for _, columns, lists in element_pieces(file, header, "vertex"):
             fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}

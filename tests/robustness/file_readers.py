@@ -21,6 +21,7 @@ from PIL import Image
 from support import splat_balls, tiny_dataset
 from support.gltf_files import UV, GltfBuilder, png
 from support.packed_meshes import draco_square, meshopt_files
+from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
 
 Files = dict[str, bytes]
@@ -224,11 +225,12 @@ def scenes() -> list[Files]:
 
 
 def splats() -> list[Files]:
-    """Packed splats of both versions of .spz."""
+    """Packed splats of both versions of .spz, and a compressed .ply."""
     from spnr_jax.formats import gaussian_files
 
     content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(12)))
-    return [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:], mtime=0)} for version in (2, 3)]
+    spz = [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:], mtime=0)} for version in (2, 3)]
+    return [*spz, {"cloud.ply": packed_splats(WHOLE.positions / 8, 255)}]
 
 
 def configs() -> list[Files]:

@@ -32,6 +32,18 @@ def ply_bytes(form: str, newline: str = "\n", rows=ROWS, properties=VERTEX, befo
     return head + camera.tobytes() + vertex.tobytes() + b"\x02\0\0\0\0\1\0\0\0"
 
 
+def packed_splats(points: np.ndarray, color: int) -> bytes:
+    """A compressed .ply of splats at points (n, 3) in [-1, 1], all of one colour 0xRRGGBBAA."""
+    chunks = -(-len(points) // 256)
+    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n"
+    head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
+    head += f"element vertex {len(points)}\n"
+    head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    x, y, z = np.round((points + 1) / 2 * [2047, 1023, 2047]).astype("<u4").T
+    rows = np.stack([x << 21 | y << 11 | z, 0 * x, 0 * x, np.full_like(x, color)], axis=1)
+    return (head + "end_header\n").encode() + np.array(chunks * ([-1] * 3 + [1] * 3), "<f4").tobytes() + rows.tobytes()
+
+
 def sphere_points(seed: int, num_points: int) -> np.ndarray:
     """Points on a sphere, much denser at one pole."""
     points = np.random.default_rng(seed).normal(size=(num_points, 3)) + [0, 1.5, 0]
