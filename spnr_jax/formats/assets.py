@@ -257,7 +257,9 @@ def decode_texels(encoded: np.ndarray, table: np.ndarray = LEVELS) -> np.ndarray
 
 
 def resize(texels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The texels (h, w) resampled with a box filter, float32."""
+    """The texels (h, w) or (h, w, c) resampled with a box filter, float32."""
+    if texels.ndim > 2:
+        return np.stack([resize(channel, height, width) for channel in np.moveaxis(texels, -1, 0)], axis=-1)
     channel = Image.fromarray(np.ascontiguousarray(texels, np.float32))
     return np.asarray(channel.resize((width, height), Image.Resampling.BOX))
 

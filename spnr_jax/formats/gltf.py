@@ -5,10 +5,9 @@ a compressed file as vertices at the origin; tests compare the rest with trimesh
 and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
-texture; defaults white, 1, 1. Of KHR_materials_pbrSpecularGlossiness, which Khronos archived, diffuse colour and
-glossiness factor are read, as those of a non-metal.  A material has one set of coordinates, that of the first texture
-that is read; another texture that lies differently is replaced by its mean.  What is not modelled is named in
-`ignored`.
+texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
+reference converter.  A material has one set of coordinates, that of the first texture that is read; another texture
+that lies differently is replaced by its mean.  What is not modelled is named in `ignored`.
 """
 
 import json
@@ -49,8 +48,9 @@ FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
 }
 RGB = slice(3)  # of the channels of texels
 DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of a normal map
-# texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, flat
-GREY, DULL, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (128, 128, 255, 255)
+DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
+# texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
+GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
 # Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a
 # mesh again costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
@@ -357,17 +357,19 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     name, extensions = str(spec.get("name", f"number {index}")), spec.get("extensions", {})
     places: list[Placement] = []
     read = partial(_read_texture, file, places)
-    look = spec.get("pbrMetallicRoughness", {})
-    if glossy := extensions.get(SPECULAR_GLOSSINESS):
-        loading.ignored.add(f"specular colours ({SPECULAR_GLOSSINESS})")
-        look = {"metallicFactor": 0.0, "roughnessFactor": 1.0 - glossy.get("glossinessFactor", 1.0)}
-        names = {"diffuseTexture": "baseColorTexture", "diffuseFactor": "baseColorFactor"}
-        look |= {ours: glossy[theirs] for theirs, ours in names.items() if theirs in glossy}
-    color, surface = read(look.get("baseColorTexture"), GREY), read(look.get("metallicRoughnessTexture"), DULL)
-    factor = look.get("baseColorFactor", (1, 1, 1, 1))
+    glossy = extensions.get(SPECULAR_GLOSSINESS)
+    look, of_color = (spec.get("pbrMetallicRoughness", {}), "baseColor") if glossy is None else (glossy, "diffuse")
+    color, factor = read(look.get(f"{of_color}Texture"), GREY), look.get(f"{of_color}Factor", (1, 1, 1, 1))
     base_color = _scaled(color, RGB, factor[:3], SRGB_TABLE)
-    metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
-    roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
+    if glossy is None:
+        surface = read(look.get("metallicRoughnessTexture"), DULL)
+        metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
+        roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
+    else:
+        surface = read(look.get("specularGlossinessTexture"), GLOSS)
+        specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
+        base_color, metallic = metallic_roughness(base_color, specular)
+        roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
     # after the textures: a missing file is the plainer reason
     material = assets.make_material(base_color, roughness, metallic)
     shown = loading.cut_out(name, material, *_alpha(spec, color, (*factor, 1.0)[3]))
@@ -389,6 +391,23 @@ def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table
     """The factor, times channels of texels (h, w, 4) by a table (256,) where there are some."""
     factor = np.asarray(factor) if isinstance(factor, np.ndarray) else np.asarray(factor, np.float64)
     return factor if texels is None or not factor.any() else decode_texels(texels[..., channels], table) * factor
+
+
+def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours, (3,) or images of two sizes."""
+    if diffuse.ndim == specular.ndim == 3:
+        size = tuple(map(max, diffuse.shape[:2], specular.shape[:2]))
+        diffuse, specular = (assets.resize(texels, *size) for texels in (diffuse, specular))
+    bright_diffuse, bright_specular = (np.sqrt((x * x) @ np.array([0.299, 0.587, 0.114])) for x in (diffuse, specular))
+    share = (1 - specular.max(axis=-1)) / (1 - DIELECTRIC)  # of the light that the surface itself does not mirror
+    b = bright_diffuse * share + bright_specular - 2 * DIELECTRIC
+    discriminant = np.maximum(b * b - 4 * DIELECTRIC * (DIELECTRIC - bright_specular), 0)
+    metallic = np.clip((-b + np.sqrt(discriminant)) / (2 * DIELECTRIC), 0, 1)
+    metallic = np.where(bright_specular < DIELECTRIC, 0, metallic)[..., None]
+    from_diffuse = diffuse * share[..., None] / np.maximum(1 - metallic, 1e-6)
+    from_specular = (specular - DIELECTRIC * (1 - metallic)) / np.maximum(metallic, 1e-6)
+    base_color = from_diffuse + (from_specular - from_diffuse) * metallic**2
+    return np.clip(base_color, 0, 1), metallic[..., 0]
 
 
 def _alpha(spec: dict, color: np.ndarray | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:

@@ -15,11 +15,12 @@ from support.point_tables import WHOLE, as_scan
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.columns import srgb_to_linear
-from spnr_jax.formats.gltf import unpack
+from spnr_jax.formats.gltf import metallic_roughness, unpack
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import sample_surface
 
 LINEAR = srgb_to_linear(CHECKER / 255)
+TEXELS = np.random.default_rng(2).integers(0, 256, (2, 3, 4))
 
 
 def corners_in_space(part):
@@ -142,6 +143,7 @@ def test_buffers_that_are_missing_or_shorter_than_their_views_are_named(tmp_path
 # Materials
 
 GLOSS = "KHR_materials_pbrSpecularGlossiness"
+GLOSSY = metallic_roughness(np.array([0.4, 0.2, 0.1]), srgb_to_linear(TEXELS[..., :3] / 255))
 GREEN, BLUE = CHECKER[..., 1] / 255, CHECKER[..., 2] / 255
 # "utilizes only the lower left quadrant of the source image, rotated clockwise 90 degrees"
 MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}}}
@@ -149,8 +151,7 @@ QUADRANT = [[0.5, 1], [0.5, 0.5], [0, 0.5], [0, 1]]
 
 
 def glossy(builder):
-    texture = {"index": builder.texture(CHECKER)}
-    look = {"specularGlossinessTexture": texture, "diffuseTexture": texture, "diffuseFactor": [0.4, 0.2, 0.1, 1]}
+    look = {"specularGlossinessTexture": {"index": builder.texture(TEXELS)}, "diffuseFactor": [0.4, 0.2, 0.1, 1]}
     return {"extensions": {GLOSS: look | {"glossinessFactor": 0.75}}}
 
 
@@ -168,7 +169,7 @@ LOOKS = {  # what makes a material; what the part or its material has; what is i
         painted(info={"texCoord": 3}), {"base_color": LINEAR.mean(axis=(0, 1))}, ["without texture coordinates"]
     ),
     "the older workflow": (
-        glossy, {"base_color": LINEAR * [0.4, 0.2, 0.1], "metallic": 0, "roughness": 0.25}, ["specular colours"]
+        glossy, {"base_color": GLOSSY[0], "metallic": GLOSSY[1], "roughness": 1 - 0.75 * TEXELS[..., 3] / 255}, ()
     ),
 }  # fmt: skip
 
@@ -199,6 +200,17 @@ def test_colours_on_a_texture_multiply_it_and_for_references_their_mean_does(tmp
     one, other = (points.base_color[points.positions[:, 0] * side < side * 1.5][0] for side in (1, -1))
     np.testing.assert_allclose(other / one, [1, 1, 1] if strict else [0.25, 0.5, 0.75], atol=1e-5)
     assert any("over a texture (their mean is used)" in note for note in asset.ignored) == strict
+
+
+def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
+    diffuse, specular = np.array([[0.4, 0.2, 0.1], [0, 0, 0]]), np.array([[0.04] * 3, [1.0, 0.8, 0.3]])
+    expected = np.array([[0.4, 0.2, 0.1], [1.0, 0.8, 0.3]])
+    base_color, metallic = metallic_roughness(diffuse, specular)
+    np.testing.assert_allclose(base_color, expected, atol=2e-2)
+    np.testing.assert_allclose(metallic, [0, 1], atol=2e-2)
+    base_color, metallic = metallic_roughness(diffuse[None], specular.repeat(3, axis=0)[None])  # images of two sizes
+    np.testing.assert_allclose(base_color[0], expected.repeat(3, axis=0), atol=2e-2)
+    np.testing.assert_allclose(metallic, [[0, 0, 0, 1, 1, 1]], atol=2e-2)
 
 
 def test_what_is_not_modelled_is_named(tmp_path):
