@@ -98,9 +98,11 @@ def _check_sizes(content: mmap.mmap) -> int:
     if chunks * length > len(content) or chunks * most < points:
         raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
     place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)
+    held = 0 if layered or chunk_size == VARIABLE else (chunks - 1) * chunk_size + 1  # the last one may be shorter
     for _ in range(chunks if layered else 0):
         count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
+        held += count
         if place > len(content) or count > LARGEST_CHUNK:
             raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
-    return 0 if chunk_size == VARIABLE else max(0, (chunks - 1) * chunk_size + 1 - points)
+    return max(0, held - points)

@@ -176,14 +176,25 @@ def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
-def test_a_field_of_three_numbers_is_a_colour_by_its_name(tmp_path, data):
-    head = "VERSION 0.7\nFIELDS x y z rgb fpfh\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 3 33\nPOINTS 420\n"
-    head += f"DATA {data}\n"
-    rows = np.zeros(420, [("xyz", "<f4", 3), ("rgb", "u1", 3), ("fpfh", "<f4", 33)])
-    rows["xyz"], rows["rgb"] = BALL, GREEN
-    plain = "\n".join(" ".join(str(number) for field in row for number in field) for row in rows)
-    cloud, _ = read(write(tmp_path, "a.pcd", head.encode() + (rows.tobytes() if data == "binary" else plain.encode())))
-    np.testing.assert_allclose(cloud.base_color[0], LINEAR, atol=1e-3)
+def test_a_field_or_list_of_three_numbers_is_a_colour_by_its_name(tmp_path, data):
+    pcd = "VERSION 0.7\nFIELDS x y z rgb fpfh\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 3 33\nPOINTS 420\n"
+    ply = f"ply\nformat {data.replace('binary', 'binary_little_endian')} 1.0\nelement vertex 420\n"
+    ply += "".join(f"property float {axis}\n" for axis in "xyz") + "property list uchar int near\n"
+    point, color, none, three = ("xyz", "<f4", 3), ("rgb", "u1", 3), ("near", "u1", 1), ("three", "u1", 1)
+    for name, head, layout in (
+        ("a.pcd", f"{pcd}DATA {data}\n", [point, color, ("fpfh", "<f4", 33)]),
+        ("a.ply", f"{ply}property list uchar uchar rgb\nend_header\n", [point, none, three, color]),
+    ):
+        rows = np.zeros(420, layout)
+        rows["xyz"], rows["rgb"] = BALL, GREEN
+        if name == "a.ply":
+            rows["three"] = 3
+        rows["rgb"][7] = GREEN[::-1]
+        plain = "\n".join(" ".join(str(number) for field in row for number in field) for row in rows)
+        content = head.encode() + (rows.tobytes() if data == "binary" else plain.encode())
+        cloud, _ = read(write(tmp_path, name, content))
+        np.testing.assert_allclose(cloud.base_color[6:8], [LINEAR, LINEAR[::-1]], atol=1e-3)
+        np.testing.assert_allclose(cloud.positions, BALL, atol=1e-6)
 
 
 SHADE = 0.5 + 0.4 * np.sin(3 * BALL[:, :1]) * np.cos(4 * BALL[:, 1:2])  # of a surface, as a camera sees it
@@ -250,7 +261,7 @@ FAR = WHOLE._replace(positions=WHOLE.positions + [500_000.0, 4_000_000.0, 120.0]
 
 
 def in_own_chunks(path, sizes, announced: int):
-    """The scan at a path packed in chunks of these sizes, whose record announces chunks of `announced` points."""
+    """The scan at a path packed in chunks of these sizes, or as its record says: chunks of `announced` points."""
     import lazrs
 
     whole = bytearray(path.read_bytes())
@@ -258,6 +269,8 @@ def in_own_chunks(path, sizes, announced: int):
     vlr = lazrs.LazVlr.new_for_compression(whole[104], 0, True)
     record = bytearray(vlr.record_data())
     struct.pack_into("<I", record, 12, announced)
+    own = announced in (0, 2**32 - 1)
+    vlr = vlr if own else lazrs.LazVlr(bytes(record))
     head = whole[:start] + struct.pack("<2x16sHH32x", b"laszip encoded", 22204, len(record)) + record
     struct.pack_into("<II", head, 96, len(head), 1)
     head[104] |= 0x80
@@ -265,7 +278,7 @@ def in_own_chunks(path, sizes, announced: int):
     packed.write(head)
     compressor, points = lazrs.LasZipCompressor(packed, vlr), np.frombuffer(whole, np.uint8, offset=start)
     for number, piece in enumerate(np.split(points, np.cumsum(sizes)[:-1] * vlr.item_size())):
-        if number:
+        if number and own:
             compressor.finish_current_chunk()
         compressor.compress_many(piece)
     compressor.done()
@@ -322,15 +335,19 @@ def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffi
         read_cloud(tmp_path / f"a{suffix}")
 
 
-@pytest.mark.parametrize("kind", [6, 7])
-def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, kind):
+@pytest.mark.parametrize(
+    ("suffix", "kind", "chunk_size", "further"),
+    [(".las", 6, 5, 5), (".las", 7, 5, 5), (".laz", 7, 5, 5), (".laz", 7, 2**32 - 1, 5), (".laz", 1, 5, 4)],
+)
+def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, suffix, kind, chunk_size, further):
     as_scan(tmp_path / "a.las", WHOLE, kind)
-    content = bytearray((tmp_path / "a.las").read_bytes())
+    in_own_chunks(tmp_path / "a.las", (5, 5, 2), chunk_size)
+    content = bytearray((tmp_path / f"a{suffix}").read_bytes())
     for count, announced in (("<Q", 247), ("<I", 107)):
         struct.pack_into(count, content, announced, 7)
-    cloud, lines = read(write(tmp_path, "a.las", bytes(content)))
+    cloud, lines = read(write(tmp_path, f"a{suffix}", bytes(content)))
     assert len(cloud.positions) == 7
-    assert "at least 5 points stand behind those that the header announces and are not read" in lines
+    assert f"at least {further} points stand behind those that the header announces and are not read" in lines
 
 
 # What is refused
