@@ -203,14 +203,15 @@ def test_colours_on_a_texture_multiply_it_and_for_references_their_mean_does(tmp
 
 
 def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
-    diffuse, specular = np.array([[0.4, 0.2, 0.1], [0, 0, 0]]), np.array([[0.04] * 3, [1.0, 0.8, 0.3]])
-    expected = np.array([[0.4, 0.2, 0.1], [1.0, 0.8, 0.3]])
+    black, wood, gold = [0, 0, 0], [0.4, 0.2, 0.1], [1.0, 0.8, 0.3]
+    diffuse, specular = np.array([wood, black, black]), np.array([[0.04] * 3, gold, black])
+    expected = np.array([wood, gold, black])
     base_color, metallic = metallic_roughness(diffuse, specular)
     np.testing.assert_allclose(base_color, expected, atol=2e-2)
-    np.testing.assert_allclose(metallic, [0, 1], atol=2e-2)
+    np.testing.assert_allclose(metallic, [0, 1, 0], atol=2e-2)
     base_color, metallic = metallic_roughness(diffuse[None], specular.repeat(3, axis=0)[None])  # images of two sizes
     np.testing.assert_allclose(base_color[0], expected.repeat(3, axis=0), atol=2e-2)
-    np.testing.assert_allclose(metallic, [[0, 0, 0, 1, 1, 1]], atol=2e-2)
+    np.testing.assert_allclose(metallic, [[0, 0, 0, 1, 1, 1, 0, 0, 0]], atol=2e-2)
 
 
 def test_what_is_not_modelled_is_named(tmp_path):
