@@ -17,8 +17,7 @@ are made (`refuse`).  For a picture, a missing image leaves plain values, and of
 import base64
 import importlib
 import io
-import os
-import re
+import itertools
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import LONGEST_NAME, Columns, srgb_to_linear
+from spnr_jax.formats.columns import LONGEST_NAME, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
@@ -45,7 +44,6 @@ MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
 SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
-OUTSIDE = re.compile(r"\.\.?($|/)|/|[^/]*:")  # how the normalised name of a file begins that is not in the folder
 
 
 def extra(package: str, name: str = "meshes") -> Any:
@@ -96,8 +94,8 @@ class Part:
 class Asset:
     """One object: its parts, what kind it is, and what its source holds that is not modelled (named, never silent).
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing; `points` the columns
-    of the vertices of a file without faces.
+    `notes` are sentences about what was made of transparent parts and of files that are missing.  The parts of a file
+    of points have vertices and no faces.
     """
 
     parts: tuple[Part, ...] = ()
@@ -105,7 +103,6 @@ class Asset:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     source: dict = field(default_factory=dict)
-    points: Columns | None = None
 
 
 def make_material(base_color: Any = 0.5, roughness: Any = 0.5, metallic: Any = 0.0, wrap: Wrap = "repeat") -> Material:
@@ -125,56 +122,42 @@ class Loading:
     """One reading of a mesh file: where its companions lie, what may be missing, and what became of it.
 
     `folder` is the mesh's; `root` is the object's, that one or one above it: a ShapeNet object keeps its images beside
-    the folder of its mesh (`../images`).  `ignored` names what the file holds that is not modelled, `points` are the
-    columns of the vertices of a file without faces.
+    the folder of its mesh (`../images`).  `ignored` names what the file holds that is not modelled.
     """
 
     def __init__(self, folder: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse"):
         self.folder, self.root, self.transparent_parts = folder, root or folder, transparent_parts
         self.strict = transparent_parts == "refuse"  # the object is wanted as it is, or not at all
         self.ignored: set[str] = set()
-        self.points: Columns | None = None
         self._said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in their order
 
     def read(self, uri: str, needed: bool = False) -> bytes | None:
         """Bytes of the file that `uri` names (percent escapes as in glTF), or of a data URI; None where it is missing.
 
-        A name in a mesh file is somebody else's text: nothing that leads out of the object's folder or to the network
-        is read.  A path of another machine, or a name in other capitals, means the file of that name beside the mesh.
-        UserError for a missing file that is `needed`, as all are where the reading is strict.
+        A name in a mesh file is somebody else's text.  It means the file at its longest end, in any letter case, that
+        is in the mesh's folder or in one above it up to the object's: nothing outside or on the network is read, and a
+        path of another machine still finds what lies beside the mesh.  UserError for a missing file that is `needed`,
+        as all are where the reading is strict.
         """
         if uri.startswith("data:"):
             head, _, payload = uri.partition(",")
             with refusing("holds a data URI that is not base64"):
                 data = unquote_to_bytes(payload)
                 return base64.b64decode(payload, validate=True) if head.endswith(";base64") else data
-        above = self.folder.relative_to(self.root).parts
-        # parent steps are resolved in the text, so that a link among the folders cannot lead them elsewhere
-        names = [os.path.normpath(os.path.join(*above, x.replace("\\", "/"))) for x in (uri, unquote(uri))]
-        inside = [self.root / name for name in names if not OUTSIDE.match(name)]
-        for place in [*inside, self._beside(unquote(uri))]:
-            if place is not None and place.is_file():
-                return place.read_bytes()
-        reason = f"names a file {'outside its own folder' if OUTSIDE.match(names[1]) else 'that is missing'}"
-        self.go_on_without(reason, repr(unquote(uri)), needed)
+        names = dict.fromkeys(text.replace("\\", "/") for text in (uri, unquote(uri)))
+        folders = [x for x in (self.folder, *self.folder.parents) if x.is_relative_to(self.root)]
+        for name, folder in itertools.product(names, folders):
+            parts = [part for part in name.split("/") if part not in ("", ".")]
+            for start in range(len(parts)):
+                if place := _find(folder, parts[start:]):
+                    return place.read_bytes()
+        self.go_on_without("names a file that is missing", repr(unquote(uri)), needed)
         return None
 
     def read_image(self, uri: str) -> np.ndarray | None:
         """Texels (h, w, 4) of the image that `uri` names; None where it is missing."""
         data = self.read(uri)
         return None if data is None else read_image(data, uri[:80])
-
-    def _beside(self, name: str) -> Path | None:
-        """The file that a path of another machine means: its longest end that is in the folder, in any letter case."""
-        names = name.replace("\\", "/").casefold().split("/")
-        for start in range(len(names)):
-            place: Path | None = self.folder
-            for name in names[start:]:
-                inside = sorted(place.iterdir()) if place and place.is_dir() else []
-                place = next((path for path in inside if path.name.casefold() == name), None)
-            if place:
-                return place
-        return None
 
     def say(self, *sentences: str, about: str = "") -> None:
         """Keeps sentences for the notes, or a name for one that begins so."""
@@ -222,6 +205,17 @@ class Loading:
         if surface.all() or not surface.any():
             return material if surface.any() else None
         return replace(material, opacity=alpha.astype(np.float32), cutoff=limit)
+
+
+def _find(folder: Path, names: list[str]) -> Path | None:
+    """The file at names, in any letter case, below a folder; the very names are preferred."""
+    for name in names:
+        if name == ".." or ":" in name or not folder.is_dir():
+            return None
+        exact = folder / name
+        alike = [] if exact.exists() else sorted(x for x in folder.iterdir() if x.name.casefold() == name.casefold())
+        folder = next(iter(alike), exact)
+    return folder if folder.is_file() else None
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------

@@ -25,7 +25,9 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Asset, ShownParts
 from spnr_jax.formats.columns import (
     DEFAULTS,
+    LINEAR,
     NORMAL,
+    POSITION,
     Columns,
     Report,
     keep_visible,
@@ -38,7 +40,7 @@ from spnr_jax.formats.columns import (
 )
 from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
-from spnr_jax.formats.surface_points import bounding_box, sample_surface
+from spnr_jax.formats.surface_points import SurfacePoints, bounding_box, sample_surface, vertex_points
 from spnr_jax.kernels import scenes
 from spnr_jax.kernels.cleaning import Clean, clean_columns
 from spnr_jax.kernels.cloud_arrays import (
@@ -64,7 +66,7 @@ TEXT_MESHES = (".obj", ".off")  # which write numbers of any length
 CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
-LOST_STEP = 1e-3  # of the extent, from which on it is said that the file itself rounded positions
+LOST_STEP = 1e-3  # of the extent of an axis, from which on it is said that the file rounded it
 MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis, at which six digits leave a hundred values at most
@@ -75,7 +77,7 @@ LEAST_POINTS = 100  # that tell normals, and what has no colour
 AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
 PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
 DEGREES, NEEDLE = 0.5, 100.0  # widest place in degrees; height over the width from which on degrees are suspected
-THIN = 0.1, 1.0  # spacings between which a plate's thickness lies whose sides cannot be told apart
+THIN = 0.1, 1.0  # spacings between which a plate is thick whose sides cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,23 +159,19 @@ class Points(NamedTuple):
 
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
     """The points of a file, read, cut out and cleaned, and how noisy they were."""
-    pieces, noise, cut = column_pieces(path, kind, how.report), 0.0, how.cut
+    pieces, sampled, noise, cut = column_pieces(path, kind, how.report), False, 0.0, how.cut
     if pieces is None:
-        from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
-
-        asset = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind)
-        pieces = None if asset.points is None else iter([asset.points])
-        for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
-            how.report(line)
-    points = _sample_mesh(asset, kind, how) if pieces is None else _interpret(_read_columns(pieces, how), how)
+        columns, sampled = _mesh_columns(path, kind, how)
+        pieces = iter([columns])
+    points = _interpret(_read_columns(pieces, how), sampled, how)
     rows, lines = scenes.select_object(points.positions, points.origin, cut.remove_plane, cut.nth, how.seed)
     points = points.take(rows)
-    if pieces is not None and how.clean != "off":
+    if not sampled and how.clean != "off":
         positions, values, done, noise = clean_columns(points.positions, points.values, how.clean)
         points, lines = Points(positions, values, points.origin), lines + done
     for line in lines:
         how.report(line)
-    if pieces is not None and len(points.positions) >= LEAST_POINTS:
+    if not sampled and len(points.positions) >= LEAST_POINTS:
         _check_values(points, how.report)
     return points, noise
 
@@ -234,13 +232,31 @@ def _find_origin(positions: np.ndarray) -> np.ndarray:
     return np.floor(low) if step > COARSEST_STEP * (high - low).max() > 0 else np.zeros(3)
 
 
-def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
-    """Points spread evenly over a mesh, those inside the box that is to be cut out."""
-    cut, report = how.cut, how.report
-    count = max(CUT_MESH if cut.is_given else 0, how.num_points or MESH_POINTS)
-    corners = np.stack(bounding_box(asset))
-    if np.abs(corners).max() > np.finfo(np.float32).max:
-        raise UserError(f"holds vertices too large for float32, more than {np.finfo(np.float32).max:.2g}")
+def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:
+    """The columns of points spread over a mesh file's surface, or of its vertices if it has no faces (False)."""
+    from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
+
+    asset, report = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind), how.report
+    for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
+        report(line)
+    sampled = any(len(part.faces) for part in asset.parts)
+    points, origin = _spread(asset, kind, how) if sampled else (vertex_points(asset), 0)
+    fields = [  # names, values, what they are where nothing is known
+        (POSITION, points.positions + origin, None),
+        (NORMAL, points.normals, 0),
+        (LINEAR, points.base_color, DEFAULTS["base_color"]),
+        *(((name,), getattr(points, name), DEFAULTS[name]) for name in ("roughness", "metallic")),
+    ]
+    unknown = [names for names, values, plain in fields if np.all(values == plain)]
+    if sampled and len(unknown) < len(DEFAULTS):  # a material that has a common value
+        unknown = []
+    known = [(names, values.reshape(len(values), -1).T) for names, values, _ in fields if names not in unknown]
+    return {name: column for names, columns in known for name, column in zip(names, columns, strict=True)}, sampled
+
+
+def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.ndarray]:
+    """Points spread over the surface of a mesh, less an origin (3,) where float32 is too coarse for them."""
+    corners, report = np.stack(bounding_box(asset)), how.report
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
     # walls and floors have few values by themselves, so only where six digits are too few
     _check_rounding(vertices, np.abs(corners).max(axis=0) > SIX_DIGITS * np.ptp(corners, axis=0), report)
@@ -250,19 +266,9 @@ def _sample_mesh(asset: Asset, kind: str, how: Reading) -> Points:
         _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
     if (origin := _find_origin(corners)).any():  # before anything of it becomes float32
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
-    drawn = sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random")
+    count = max(CUT_MESH if how.cut.is_given else 0, how.num_points or MESH_POINTS)
     report(f"{count} points spread over the surface of the mesh")
-    values = {name: getattr(drawn, name) for name in DEFAULTS}
-    if all((values[name] == default).all() for name, default in DEFAULTS.items()):
-        report("no material in the mesh: base_color 0.5, roughness 0.5, metallic 0 taken everywhere")
-        values["materials_known"] = np.zeros(count)
-    points = Points(drawn.positions.astype(np.float64), values | {"normals": drawn.normals}, origin)
-    if not cut.crop:
-        return points
-    whole = points.positions + origin
-    inside = scenes.is_inside(whole, cut.crop)
-    report(scenes.describe_crop(int(inside.sum()), count, cut.crop, whole.min(axis=0), whole.max(axis=0)))
-    return points.take(inside)
+    return sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random"), origin
 
 
 def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
@@ -301,19 +307,23 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     return columns
 
 
-def _interpret(columns: Columns, how: Reading) -> Points:
-    """What the columns of a file of points mean, equal and nearly equal points as one."""
-    columns, report = keep_visible(columns, how.cut.keep_noise, how.report), how.report
-    columns = _without_no_data(columns, report)
+def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
+    """What the columns mean; of points that were not sampled from a mesh, equal and nearly equal ones count once."""
+    report = how.report
+    if not sampled:
+        columns = _without_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
     positions = stack_columns(columns)
-    _check_steps(positions, [columns[axis] for axis in "xyz"], report)
-    _check_rounding(positions, np.ones(3, bool), report)
+    if not sampled:
+        _check_steps(positions, [columns[axis] for axis in "xyz"], report)
+        _check_rounding(positions, np.ones(3, bool), report)
     origin = _find_origin(positions)
     values, directions = materials(columns, report), normals(columns)
     if directions is not None:
         values["normals"] = directions
     elif set(NORMAL) <= columns.keys():
         report("normals of the file left out: none is a direction with a sign")
+    if sampled:
+        return Points(positions - origin, values, origin)
     places, values, merged = merge_repeats(positions - origin, values)
     if merged:
         report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
@@ -377,8 +387,7 @@ def _check_values(points: Points, report: Report) -> None:
             near = cKDTree(positions[~black]).query(positions[black], 3)[1]
             values["base_color"] = values["base_color"].copy()
             values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
-    centred = positions - positions.mean(axis=0)
-    thickness = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]) / max(measure_spacing(tree), 1e-300)
+    thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / measure_spacing(tree)
     if THIN[0] < thickness < THIN[1]:
         report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
     if "normals" in values and (reason := _doubt(positions, values["normals"])):

@@ -32,29 +32,27 @@ POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
 PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
-ALIASES = (  # ours first, then what stands for it: the first group that is there counts
-    (
-        *("x y z", "points_0 points_1 points_2", "points_m_xyz_0 points_m_xyz_1 points_m_xyz_2", "pos_x pos_y pos_z"),
-        *("position_x position_y position_z", "location_x location_y location_z", "point_x point_y point_z"),
-        *("x_m y_m z_m", "x_coord y_coord z_coord", "px py pz", "easting northing elevation"),
-        *("easting northing height", "e n h", "x y height", "x y elevation"),
-    ),
-    (
-        *("base_color_r base_color_g base_color_b", "base_color_red base_color_green base_color_blue"),
-        *("basecolor_r basecolor_g basecolor_b", "albedo_r albedo_g albedo_b"),
-    ),
-    (
-        *("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "diffuse_r diffuse_g diffuse_b"),
-        *("rf gf bf", "color_r color_g color_b", "color_red color_green color_blue", "colorr colorg colorb"),
-        *("rgb_0 rgb_1 rgb_2", "colors_0 colors_1 colors_2", "vertex_red vertex_green vertex_blue"),
-    ),
-    ("nx ny nz", "normal_x normal_y normal_z", "normalx normaly normalz", "normals_0 normals_1 normals_2"),
-    ("roughness", "rough", "roughness_factor", "pbr_roughness"),
-    ("metallic", "metalness", "metallic_factor", "metal", "pbr_metallic"),
-    ("intensity", "reflectance", "reflectivity", "amplitude", "gray", "grey"),
-    ("alpha", "a", "diffuse_alpha", "color_a"),
-    *((name,) for name in ("rgb", "rgba", "opacity", "splat_opacity", "classification", "withheld")),
-)
+ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
+ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
+    ours: [[name.replace("_", "") for name in ours]]
+    + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
+    + [names.split() for names in others.split("|") if names]
+    for ours, stems, others in (
+        (
+            *(POSITION, "points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p"),
+            "xm ym zm|xcoord ycoord zcoord|easting northing elevation|easting northing height|x y height|x y elevation",
+        ),
+        (LINEAR, "basecolor albedo", ""),
+        (SRGB, "color colors rgb diffuse vertex", "r g b|rf gf bf"),
+        (NORMAL, "n normal normals", ""),
+        (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
+        (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
+        (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
+        (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
+        *(((name,), "", "") for name in ("rgb", "rgba", "opacity", "classification", "withheld", "splat_opacity")),
+    )
+}
+ARRAYS = {name.removesuffix("0") for group in ALIASES.values() for names in group for name in names}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
@@ -69,17 +67,36 @@ FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog,
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
+def name_columns(fields: dict[str, np.ndarray]) -> Columns:
+    """Columns (points,) of fields of numbers (points,) or (points, c); of two to four of one name name:0, name:1 ...
+
+    So ParaView names them; fields of more numbers are none.
+    """
+    columns: Columns = {}
+    for name, values in fields.items():
+        width = values.shape[1] if values.ndim == 2 else 1
+        if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
+            several = {f"{name.lower()}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
+            columns |= several or {name.lower(): values.reshape(-1)}
+    return columns
+
+
+def plain_name(name: str) -> str:
+    """A name without its separators."""
+    return re.sub(r"[\s.:_-]+", "", name.strip().lower().removeprefix(PREFIX))
+
+
 def rename(columns: Columns) -> Columns:
     """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
-    plain = {re.sub(r"[\s.:_-]+", "_", name.strip().removeprefix(PREFIX)): x for name, x in columns.items()} | columns
+    plain = {plain_name(name): x for name, x in columns.items()} | columns
     found: Columns = {}
-    for group in ALIASES:
-        names = next((names.split() for names in group if set(names.split()) <= plain.keys()), [])
-        found |= dict(zip(group[0].split(), (plain[name] for name in names), strict=False))
-    if set(SPLAT) <= plain.keys():
+    for ours, theirs in ALIASES.items():
+        names = next((names for names in theirs if set(names) <= plain.keys()), [])
+        found |= dict(zip(ours, (plain[name] for name in names), strict=False))
+    if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
-            found[name] = np.clip(0.5 + C0 * np.asarray(plain[constant], np.float64), 0, 1)
-    if "opacity" in found and plain.keys() & {SPLAT[0], "scale_0", "rot_0"}:
+            found[name] = np.clip(0.5 + C0 * np.asarray(columns[constant], np.float64), 0, 1)
+    if "opacity" in found and columns.keys() & {SPLAT[0], "scale_0", "rot_0"}:
         found["splat_opacity"] = found.pop("opacity")
     return {name: x for name, x in found.items() if name not in ("rgb", "rgba") or x.dtype.itemsize >= 4}
 
@@ -254,10 +271,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
         lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
     values = np.clip(values, 0, 1)
-    brightness = values.max(axis=-1)
-    dark = {"0": np.mean(brightness == 0), "nearly black": np.mean(brightness < DARK)}
-    if word := next((word for word, share in dark.items() if len(values) >= LEAST and share > MOSTLY), None):
-        lines.append(f"{dark[word]:.0%} of {name} are {word}: the picture will be black")
+    if not linear and len(values) >= LEAST and (share := np.mean(values.max(axis=-1) < DARK)) > MOSTLY:
+        lines.append(f"{share:.0%} of {name} are nearly black: the picture will be black")
     return values if linear else srgb_to_linear(values), lines
 
 

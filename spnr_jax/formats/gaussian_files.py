@@ -36,8 +36,12 @@ SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm o
 HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
 PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
 MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
-COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
 CHUNK = 256  # splats
+PACKED_BITS = {  # of a compressed .ply: the property, and the place and number of its bits
+    **{"x": ("packed_position", 21, 11), "y": ("packed_position", 11, 10), "z": ("packed_position", 0, 11)},
+    **{name: ("packed_color", 24 - 8 * i, 8) for i, name in enumerate((*SRGB, "splat_opacity"))},
+}
+COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
@@ -150,23 +154,16 @@ def spz_columns(path: Path) -> Columns:
     return dict(zip((*"xyz", *SRGB, "splat_opacity"), columns.T, strict=True))
 
 
-def decompress_columns(chunks: Columns, packed: Columns) -> Columns:
+def unpack_columns(chunks: Columns, packed: Columns) -> Columns:
     """The columns of a compressed .ply from its elements `chunk` and `vertex`."""
     columns = {}
-    try:
-        place, color = (np.asarray(packed[name], np.uint32) for name in ("packed_position", "packed_color"))
-        row, boxes = np.arange(len(place)) // CHUNK, len(chunks["min_x"])
-        if len(place) and row[-1] >= boxes:
-            raise UserError(f"has {len(place)} splats in {boxes} chunks: broken file")
-        bits = {"x": (place, 21, 11), "y": (place, 11, 10), "z": (place, 0, 11)}
-        bits |= {name: (color, shift, 8) for name, shift in zip((*SRGB, "splat_opacity"), (24, 16, 8, 0), strict=True)}
-        for name, (words, shift, size) in bits.items():
-            columns[name] = (words >> shift & 2**size - 1) / (2**size - 1)
-            if words is place or f"min_{name[0]}" in chunks:
-                low, high = (np.asarray(chunks[f"{end}_{name[0]}"], np.float64)[row] for end in ("min", "max"))
+    with refusing("is a broken file of compressed splats"):
+        for name, (source, shift, size) in PACKED_BITS.items():
+            columns[name] = (np.asarray(packed[source], np.uint32) >> shift & 2**size - 1) / (2**size - 1)
+            if size > 8 or f"min_{name[0]}" in chunks:
+                chunk = np.arange(len(columns[name])) // CHUNK
+                low, high = (np.asarray(chunks[f"{end}_{name[0]}"], np.float64)[chunk] for end in ("min", "max"))
                 columns[name] = low + columns[name] * (high - low)
-            if words is color:
-                columns[name] = np.where(np.isfinite(columns[name]), np.clip(columns[name], 0, 1), np.nan)
-    except KeyError as error:
-        raise UserError(f"is a compressed file of splats without the property {error.args[0]}") from None
+            if size == 8:
+                columns[name] = np.clip(columns[name], 0, 1)
     return columns

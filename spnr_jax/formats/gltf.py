@@ -23,13 +23,14 @@ from trimesh.transformations import quaternion_matrix
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels, make_material
-from spnr_jax.formats.columns import LINEAR, LONGEST_NAME, NORMAL, Columns
+from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
+from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 CHUNK_JSON = 0x4E4F534A  # of a .glb
+LOOSE = {"POINTS", "LINES", "LINE_LOOP", "LINE_STRIP"}
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
@@ -50,12 +51,8 @@ DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 # texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
-WORKFLOWS = (  # textures of colour and of reflection, a stand-in for the latter, factor of colour
-    ("baseColorTexture", "metallicRoughnessTexture", DULL, "baseColorFactor"),
-    ("diffuseTexture", "specularGlossinessTexture", GLOSS, "diffuseFactor"),
-)
-# Faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a mesh again
-# costs as much as PLACING faces.
+# Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a
+# mesh again costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
 
 
@@ -66,30 +63,34 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     for extension in document.get("extensionsRequired", []):
         if extension not in (*READABLE, SPLATS) and not extension.startswith("KHR_materials_"):
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
-    if not loading.strict and (points := _points(file, drawn)):
-        loading.points = points
-        return []
+    modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
+    # points are read where there is nothing else
+    wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
     ignored |= {key for key in ("animations", "skins") if document.get(key)}
     ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
     read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
     for primitive, matrix in drawn:
-        if not (mode := MODES[primitive.get("mode", 4)]).startswith("TRIANGLE"):
+        if not (mode := modes[id(primitive)]).startswith(wanted):
             ignored.add(f"{mode} primitives")
             continue
-        ignored |= {"KHR_materials_variants"}.intersection(primitive.get("extensions", {}))
+        extensions = primitive.get("extensions", {})
+        if SPLATS in extensions:
+            raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
+        ignored |= {"KHR_materials_variants"}.intersection(extensions)
+        ignored |= {f"attribute {name[:LONGEST_NAME]}" for name in primitive["attributes"] if name.startswith("_")}
         ignored |= {"morph targets"} if primitive.get("targets") else set()
         number, key = primitive.get("material"), id(primitive)
         material, placement = read_look(number)
         if material is None:
             continue
         if key in shapes:
-            repeated += len(shapes[key][1]) + PLACING
+            repeated += len(shapes[key][0]["POSITION"]) + len(shapes[key][1]) + PLACING
         else:
             shapes[key] = _shape(file, primitive, mode, f"TEXCOORD_{placement.texcoord_set}")
         if repeated > MOST_REPEATED:
-            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} faces)")
+            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
         if asks_alpha and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
@@ -124,32 +125,6 @@ def list_primitives(document: dict) -> Iterator[tuple[dict, np.ndarray]]:
         stack += [(child, parent @ own) for child in reversed(node.get("children", []))]
 
 
-def _points(file: "GltfFile", drawn: list[tuple[dict, np.ndarray]]) -> Columns | None:
-    """The columns of the points of a scene without triangles; None if it has some, or no points either."""
-    modes = {MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
-    if "POINTS" not in modes or any(mode.startswith("TRIANGLE") for mode in modes):
-        return None
-    pieces: list[Columns] = []
-    colored = False
-    for primitive, matrix in (pair for pair in drawn if pair[0].get("mode") == 0):
-        if SPLATS in primitive.get("extensions", {}):
-            raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")
-        columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0")
-        part = _place(columns, np.zeros((0, 3), np.int64), make_material(), Placement(), matrix)
-        look = file.document["materials"][primitive["material"]] if "material" in primitive else {}
-        factor = look.get("pbrMetallicRoughness", {}).get("baseColorFactor")
-        colored |= factor is not None or part.colors is not None
-        rgba = columns.get("COLOR_0", np.ones((len(part.positions), 4)))
-        rgba = rgba * (factor or (1, 1, 1, 1))[: rgba.shape[1]]
-        values = zip((*"xyz", *LINEAR, "alpha"), (*part.positions.T, *rgba.T), strict=False)
-        found = dict(values) | dict(zip(NORMAL, () if part.normals is None else part.normals.T, strict=False))
-        rows = file.accessor(primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive else slice(None)
-        pieces.append({name: column[rows] for name, column in found.items()})
-    left_out = () if colored else LINEAR
-    shared = [name for name in pieces[0] if all(name in piece for piece in pieces) and name not in left_out]
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in shared}
-
-
 def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
     """The columns (v, width) that a material needs, and the faces (f, 3), of a primitive in its own frame."""
     if DRACO in primitive.get("extensions", {}):
@@ -159,6 +134,8 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     order = np.arange(len(columns["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    if mode == "POINTS":
+        return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_STRIP":
         return columns, strip_faces(order)
     if mode == "TRIANGLE_FAN":
@@ -199,8 +176,7 @@ class GltfFile:
         version = str(self.document.get("asset", {}).get("version", "1.0"))
         if not version.startswith("2."):
             raise UserError(f"is glTF {version}; only glTF 2.0 can be read: convert it")
-        self._buffers: dict[int, bytes] = {}
-        self._views: dict[int, memoryview] = {}
+        self.view, self._buffer = cache(self._read_view), cache(self._read_buffer)
         self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
 
     def columns(self, attributes: dict[str, int], *names: str) -> Columns:
@@ -233,27 +209,24 @@ class GltfFile:
             raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
         return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
 
-    def view(self, index: int) -> memoryview:
-        """What a buffer view holds."""
-        if index not in self._views:
-            view = self.document["bufferViews"][index]
-            packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
-            data = self._slice(packed or view)
-            self._views[index] = memoryview(unpack(data, packed)) if packed else data
-        return self._views[index]
-
-    def _slice(self, view: dict) -> memoryview:
-        start, length, number = view.get("byteOffset", 0), view["byteLength"], view["buffer"]
-        if number not in self._buffers:
-            uri = self.document["buffers"][number].get("uri")
-            data = self._binary if uri is None else self.loading.read(uri, needed=True)
-            if data is None:
-                raise UserError(f"buffer {number} has no data in the file")
-            self._buffers[number] = data
-        buffer, end = self._buffers[number], start + length
+    def _read_view(self, index: int) -> memoryview:
+        view = self.document["bufferViews"][index]
+        packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
+        place = packed or view
+        start, buffer = place.get("byteOffset", 0), self._buffer(place["buffer"])
+        end = start + place["byteLength"]
         if not 0 <= start <= end <= len(buffer):
+            number = place["buffer"]
             raise UserError(f"buffer {number} has {len(buffer)} bytes where {end} are needed: truncated file")
-        return memoryview(buffer)[start:end]
+        data = memoryview(buffer)[start:end]
+        return memoryview(unpack(data, packed)) if packed else data
+
+    def _read_buffer(self, number: int) -> bytes:
+        uri = self.document["buffers"][number].get("uri")
+        data = self._binary if uri is None else self.loading.read(uri, needed=True)
+        if data is None:
+            raise UserError(f"buffer {number} has no data in the file")
+        return data
 
     def unpack_mesh(self, primitive: dict) -> None:
         """Makes ready what a primitive keeps in a Draco mesh; whole numbers are as they were before, not normalised.
@@ -385,15 +358,15 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     places: list[Placement] = []
     read = partial(_read_texture, file, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
-    look = spec.get("pbrMetallicRoughness", {}) if glossy is None else glossy
-    of_color, of_surface, stand_in, of_factor = WORKFLOWS[glossy is not None]
-    color, surface = read(look.get(of_color), GREY), read(look.get(of_surface), stand_in)
-    factor = look.get(of_factor, (1, 1, 1, 1))
+    look, of_color = (spec.get("pbrMetallicRoughness", {}), "baseColor") if glossy is None else (glossy, "diffuse")
+    color, factor = read(look.get(f"{of_color}Texture"), GREY), look.get(f"{of_color}Factor", (1, 1, 1, 1))
     base_color = _scaled(color, RGB, factor[:3], SRGB_TABLE)
     if glossy is None:
+        surface = read(look.get("metallicRoughnessTexture"), DULL)
         metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
         roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
     else:
+        surface = read(look.get("specularGlossinessTexture"), GLOSS)
         specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
         base_color, metallic = metallic_roughness(base_color, specular)
         roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
@@ -421,18 +394,17 @@ def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table
 
 
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours, (*n, 3) or images of two sizes."""
+    """base_color (*n, 3) and metallic (*n,) of linear diffuse and specular colours, (3,) or images of two sizes."""
     if diffuse.ndim == specular.ndim == 3:
-        height, width = map(max, diffuse.shape[:2], specular.shape[:2])
-        diffuse, specular = assets.resize(diffuse, height, width), assets.resize(specular, height, width)
-    diffuse, specular = np.broadcast_arrays(diffuse, specular)
-    strength = 1 - specular.max(axis=-1)
+        size = tuple(map(max, diffuse.shape[:2], specular.shape[:2]))
+        diffuse, specular = (assets.resize(texels, *size) for texels in (diffuse, specular))
     bright_diffuse, bright_specular = (np.sqrt((x * x) @ np.array([0.299, 0.587, 0.114])) for x in (diffuse, specular))
-    b = bright_diffuse * strength / (1 - DIELECTRIC) + bright_specular - 2 * DIELECTRIC
+    share = (1 - specular.max(axis=-1)) / (1 - DIELECTRIC)  # of the light that the surface itself does not mirror
+    b = bright_diffuse * share + bright_specular - 2 * DIELECTRIC
     discriminant = np.maximum(b * b - 4 * DIELECTRIC * (DIELECTRIC - bright_specular), 0)
     metallic = np.clip((-b + np.sqrt(discriminant)) / (2 * DIELECTRIC), 0, 1)
     metallic = np.where(bright_specular < DIELECTRIC, 0, metallic)[..., None]
-    from_diffuse = diffuse * strength[..., None] / (1 - DIELECTRIC) / np.maximum(1 - metallic, 1e-6)
+    from_diffuse = diffuse * share[..., None] / np.maximum(1 - metallic, 1e-6)
     from_specular = (specular - DIELECTRIC * (1 - metallic)) / np.maximum(metallic, 1e-6)
     base_color = from_diffuse + (from_specular - from_diffuse) * metallic**2
     return np.clip(base_color, 0, 1), metallic[..., 0]

@@ -19,6 +19,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import extra
+from spnr_jax.formats.columns import Columns, Report
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
@@ -26,18 +27,19 @@ LARGEST_CHUNK = 2**24  # points; writers use 50,000
 VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
 PIECE_BYTES = 2**23  # of points in memory at a time
 COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
-# places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts, the count of version 1.4
-SIZES, COUNT_14, SMALLEST_HEADER = 94, 247, 227
+# places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts; of version 1.4 counts of records and points
+SIZES, EVLRS, COUNT_14, SMALLEST_HEADER = 94, 243, 247, 227
 COMPRESSED = 0xC0  # bits of the point format
 
 
-def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
+def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns x y z, the colours and the intensity of a scan, some points at a time."""
     laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         try:
-            _check_sizes(content)
+            if more := _check_sizes(content):
+                report(f"at least {more:,} points stand behind those that the header announces and are not read")
         except struct.error:
             raise UserError("is cut off: its header or compressed data ends too early") from None
     try:
@@ -55,8 +57,8 @@ def las_pieces(path: Path) -> Iterator[dict[str, np.ndarray]]:
         raise UserError(f"is a broken LAZ file ({error})") from None
 
 
-def _check_sizes(content: mmap.mmap) -> None:
-    """ValueError if a scan announces more than its file holds, in its header or to lazrs."""
+def _check_sizes(content: mmap.mmap) -> int:
+    """Points behind those announced, at least; ValueError if more than there are is announced, also to lazrs."""
     if content[:4] != b"LASF" or len(content) < SMALLEST_HEADER:
         raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
     place, data, records, kind, length, points = struct.unpack_from("<HIIBHI", content, SIZES)
@@ -69,7 +71,8 @@ def _check_sizes(content: mmap.mmap) -> None:
             raise UserError(
                 f"is cut off: its header announces {points} points of {length} bytes in {len(content)} bytes"
             )
-        return
+        further = content[25] == 3 or (content[25] > 3 and any(content[EVLRS : EVLRS + 4]))  # other things behind them
+        return 0 if further else (len(content) - data) // length - points
     for _ in range(records):
         name, number, size = struct.unpack_from("<16sHH", content, place + 2)
         if name.rstrip(b"\0") == NAME and number == NUMBER:
@@ -95,8 +98,11 @@ def _check_sizes(content: mmap.mmap) -> None:
     if chunks * length > len(content) or chunks * most < points:
         raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
     place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)
+    held = 0 if layered or chunk_size == VARIABLE else (chunks - 1) * chunk_size + 1  # the last one may be shorter
     for _ in range(chunks if layered else 0):
         count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
+        held += count
         if place > len(content) or count > LARGEST_CHUNK:
             raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
+    return max(0, held - points)

@@ -17,7 +17,6 @@ import numpy as np
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import CHANNELS, Asset, Loading, Material, Part, TransparentParts, make_material
-from spnr_jax.formats.columns import full_scale
 from spnr_jax.formats.gltf import load_gltf
 from spnr_jax.formats.obj import load_obj
 from spnr_jax.formats.polygons import PLAIN
@@ -58,19 +57,19 @@ def load_mesh(
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
         parts = READERS[kind](path, loading)
-        if loading.strict or loading.points is None:
+        for part in parts:
+            _check_columns(part)
+        if loading.strict or not parts or any(len(part.faces) for part in parts):
             parts = assemble(parts, loading)
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     ignored, notes = tuple(sorted(loading.ignored)), loading.notes()
-    return Asset(parts=tuple(parts), points=loading.points, ignored=ignored, notes=notes, source=source)
+    return Asset(parts=tuple(parts), ignored=ignored, notes=notes, source=source)
 
 
 def assemble(parts: list[Part], loading: Loading) -> list[Part]:
     """The parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     if not parts:
         raise UserError(f"has nothing to draw: {'; '.join(notes)}" if (notes := loading.notes()) else "has no faces")
-    for part in parts:
-        _check_columns(part)
     parts = parts if loading.strict else _without_false_normals(_finite(parts, loading), loading)
     low, high = bounding_box(Asset(parts=tuple(parts)))
     smallest, degenerate = DEGENERATE_AREA * np.sum((high - low) ** 2), 0
@@ -165,13 +164,11 @@ def _check_colors(part: Part, ignored: set[str]) -> np.ndarray | None:
         return None
     if not np.isfinite(part.colors).all():
         raise UserError("has vertex colours that are not finite (NaN or infinity)")
-    highest = float(part.colors.max())
-    white = full_scale(part.colors.dtype, highest, linear=highest < 2)
-    if white > 1:
-        ignored.add(f"vertex colours up to {highest:g} (taken as linear in 0..{white:g})")
-    elif part.colors.min() < 0 or highest > 1:
+    if part.colors.max() > 2:
+        raise UserError(f"has linear vertex colours up to {part.colors.max():g}; expected 0 to 1")
+    if part.colors.min() < 0 or part.colors.max() > 1:
         ignored.add("vertex colours outside [0, 1] (clipped)")
-    return np.clip(part.colors / white, 0, 1)
+    return np.clip(part.colors, 0, 1)
 
 
 def _identity(material: Material) -> tuple:

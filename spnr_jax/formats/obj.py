@@ -16,7 +16,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
+from spnr_jax.formats.columns import SRGB, Columns, colors_of, full_scale
 from spnr_jax.formats.point_tables import open_text
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
@@ -38,16 +38,17 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         raise UserError("has no faces, and no vertices")
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
-    columns = _columns(text, loading)
-    if not text["f sizes"]:
-        loading.points = columns
-        return []
-    library: dict[str, dict[str, str]] = {}
-    for names in map(str.strip, text["mtllib"]):  # one name with spaces, or several without
-        single = (loading.folder / names).is_file() or len(names.split()) == 1
-        for name in [names] if single else names.split():
-            library |= parse_mtl(loading.read(name) or b"")
+    columns = _columns(text)
     colors, notes = colors_of(columns) or (None, [])
+    loading.say(*notes)
+    if not text["f sizes"]:
+        normals = _table(text["vn"], 3) if len(text["vn"]) == len(text["v"]) else None
+        material = make_material(0.5 if colors is None else 1.0)
+        none = np.zeros((0, 3), np.int64)
+        return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
+    library: dict[str, dict[str, str]] = {}
+    for name in text["mtllib"]:
+        library |= parse_mtl(loading.read(name.strip()) or b"")
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text["usemtl"]):
         looks[name] = make_material() if not name else _look(name, library.get(name), loading)
@@ -60,7 +61,6 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         loading.ignored.add(f"{loose:,} vertices of no face")
     if text["vn"] and any(part.normals is None for part in parts):
         loading.ignored.add("normals that only some faces have (flat shading is used)")
-    loading.say(*notes)
     return parts
 
 
@@ -91,24 +91,12 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
     return np.loadtxt(rows, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
 
 
-def _columns(text: Rests, loading: Loading) -> Columns:
-    """The columns of the vertices: positions, colours where some row has them, normals where no face does."""
-    try:
-        table = _table(text["v"], None)
-    except ValueError:  # rows of different lengths
-        table = _table(text["v"], 3)
-        with_color = np.array([len(row.partition("#")[0].split()) >= 6 for row in text["v"]])
-        if with_color.any():
-            some = _table([row for row, has in zip(text["v"], with_color, strict=True) if has], 6)[:, 3:]
-            table = np.concatenate([table, np.broadcast_to(some.mean(axis=0), table.shape)], axis=1)
-            table[with_color, 3:] = some
-            loading.say(f"{np.sum(~with_color):,} of {len(table):,} vertices have no colour: the others' mean is taken")
+def _columns(text: Rests) -> Columns:
+    """The columns of the vertices: positions, and perhaps colours."""
+    table = _table(text["v"], None)
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
-    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
-    if not text["f sizes"] and len(text["vn"]) == len(table):
-        columns |= dict(zip(NORMAL, _table(text["vn"], 3).T, strict=True))
-    return columns
+    return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
 
 
 def _parts(

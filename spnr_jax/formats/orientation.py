@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from spnr_jax.formats.row_files import element_pieces, read_pcd_header, read_ply_header
+from spnr_jax.formats.row_files import element_pieces, read_header
 from spnr_jax.surfels.normals import find_visible, measure_spacing
 
 ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
@@ -83,7 +83,7 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
     if kind != ".pcd":
         return None
     with path.open("rb") as file:
-        header = read_pcd_header(file)
+        header = read_header(file, kind)
     if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
         return None
     place = np.array(header.sensor)
@@ -102,7 +102,7 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
 def _camera_of(path: Path) -> Sensor | None:
     """The camera that a PLY file begins with."""
     with path.open("rb") as file:
-        header = read_ply_header(file)
+        header = read_header(file, ".ply")
         if [name for name, _, _ in header.elements][:1] != ["camera"]:
             return None
         _, columns, _ = next(element_pieces(file, header, "camera"))

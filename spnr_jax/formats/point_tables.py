@@ -1,16 +1,12 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
 Numbers of text are separated by commas, semicolons or blanks, also behind the last one; a decimal comma is told by that
-nothing else separates there.  Lines of one whole number count the points.  A header line names the columns, also behind
-#, % or //, with units in brackets; a column without a name is a table's index.  Without a header the number of columns
-tells, behind one that only counts, and for normals and colours their values:
+nothing else separates there, or by quotes.  Lines of one whole number count the points.  A header line names the
+columns, also behind #, % or //, with units in brackets; a column without a name is a table's index.  Without a header
+the values tell what stands behind x y z: normals, r g b, alpha, roughness, metallic, intensity, or any other number.
 
-    3 x y z | 4 + intensity | 6 + r g b, or + nx ny nz if these have length 1 | 7 + r g b alpha, r g b and any number,
-    or intensity r g b (where both could be, in .pts alone) | 8 + r g b roughness metallic
-    9 + r g b and nx ny nz in either order
-
-    .npz    arrays (points, 3) or (points,) under the names of ARRAY_COLUMNS; beside a first one without a name,
-            those that look like colours or normals; they come whole where they are compressed
+    .npz    arrays (points, c) or (points,), whose names are those of columns; of the points as in text without a
+            header, also of arrays without names; they come whole where they are compressed
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
 Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
@@ -21,7 +17,7 @@ import contextlib
 import io
 import re
 import threading
-import warnings
+from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -30,7 +26,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import NORMAL, POSITION, Columns, Report, list_names
+from spnr_jax.formats.columns import ARRAYS, NORMAL, POSITION, Columns, Report, list_names, name_columns, plain_name
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
@@ -40,8 +36,10 @@ NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
 PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
+MOST_LINES, MOST_COLUMNS = 99, 16  # before the numbers, in which names are looked for; of a table without names
 COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)", re.IGNORECASE)  # as the libraries of Windows write it
@@ -50,42 +48,32 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
-UNNAMED = tuple(f"arr_{i}" for i in range(9))  # names by np.savez of arrays that were given none
-ARRAY_COLUMNS = {
-    **dict.fromkeys(
-        ("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coord", "coords", "arr_0"), POSITION
-    ),
-    **dict.fromkeys(("base_color", "albedo"), ("base_color_r", "base_color_g", "base_color_b")),
-    **dict.fromkeys(("colors", "rgb", "color"), COLOR),
-    **{name: (name,) for name in (*POSITION, *COLOR, *NORMAL, "red", "green", "blue", "intensity", "roughness")},
-    **dict.fromkeys(("metallic", "metalness"), ("metallic",)),
-    **dict.fromkeys(("normals", "normal"), NORMAL),
-}
+UNNAMED = tuple(f"arr{i}" for i in range(9))  # names by np.savez of arrays that were given none
+POINTS = ("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coord", "coords", "arr0")
 
 
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns of a text file, some points at a time; the last line before the numbers may name them."""
+    """The columns of a text file, some points at a time; a line before the numbers may name them."""
     with open_text(path) as file:
-        numbered = ((number, line.strip().replace('"', "")) for number, line in enumerate(file, 1))
-        header, is_comment, announced, first = _header(numbered)
+        numbered = ((number, _unquote(line.strip())) for number, line in enumerate(file, 1))
+        before, first = _split_header(numbered)
         if not first[1]:
-            raise UserError(f"holds 0 points: no row of numbers, only {header[:SHOWN]!r}")
+            remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
+            raise UserError(f"holds 0 points: no row of numbers, only {remark[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
         parts = first[1].split()
         if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
             delimiter = None  # these are decimal commas
-        trailing = ""  # separators behind the last number, which are none before one that is not known
-        if delimiter and first[1].endswith(delimiter):
-            of_header = header.rstrip(delimiter).count(delimiter)
-            trailing = delimiter if of_header != first[1].count(delimiter) else ""
+        announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
 
         def rows_of_numbers() -> Iterator[Line]:
             nonlocal announced
             for number, text in chain([first], numbered):
                 if text.isdecimal():
                     announced += int(text[:SHOWN])
-                elif not text.startswith(COMMENTS) and (plain := _plain(text, delimiter, trailing)):
-                    yield number, plain
+                elif text and not text.startswith(COMMENTS):
+                    text = EMPTY.sub("nan", text) if delimiter else text
+                    yield number, text if delimiter == "," else text.replace(",", ".")
 
         lines = rows_of_numbers()
         names: tuple[str, ...] = ()
@@ -94,7 +82,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             words = rows[0][1].split(delimiter)
             count, found = len(names) or len(words), found + len(rows)
             table = load_text(rows, "line", count, delimiter, ndmin=2)
-            names = names or _names(header, is_comment, table, path.suffix.lower() == ".pts", report)
+            names = names or _names(before, table, path.suffix.lower(), report)
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -113,36 +101,21 @@ def encoding_of(head: bytes) -> str:
     return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
 
 
-def _plain(text: str, delimiter: str | None, trailing: str) -> str:
-    """A row with decimal points, without separators behind the last number."""
-    text = text.rstrip(" \t" + trailing)
-    text = EMPTY.sub("nan", text) if delimiter else text
-    return text if delimiter == "," else text.replace(",", ".")
+def _unquote(text: str) -> str:
+    """A line without quotes; a comma inside of them is a decimal one."""
+    return re.sub('"([^"]*)"?', lambda found: found[1].replace(",", "."), text) if '"' in text else text
 
 
-def _header(lines: Iterator[Line]) -> tuple[str, bool, int, Line]:
-    """What stands before the numbers: names or the last remark, whether as a comment, and a count of points.
-
-    Then the first row of numbers (0, "" if there is none).
-    """
-    header, is_comment, announced = "", True, 0
+def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
+    """The last lines before the rows of numbers, and the first row (0, "" if there is none)."""
+    before: deque[str] = deque(maxlen=MOST_LINES)
     for number, line in lines:
-        text = re.sub(r"^(#|//|%)\s*", "", line)
-        words = re.split(r"[\s;,]+", text[:LONGEST_HEADER])
-        if text and not NUMBER.fullmatch(words[0]):
-            named = "x" in _split_names(header, r"[\s,;]+") and "x" not in map(str.lower, words)
-            if re.search(r"\w", UNITS.sub("", text[:LONGEST_HEADER])) and not (named and text == line):
-                header, is_comment = text[:LONGEST_HEADER], text != line
-        elif words[0].isdecimal() and len(words) < (3 if text == line else 2):  # and perhaps of columns
-            announced = max(announced, int(words[0]))
-        elif text and text == line and words != list(map(str, range(len(words)))):  # as pandas names an array's
-            return header, is_comment, announced, (number, line)
-    return header, is_comment, announced, (0, "")
-
-
-def _split_names(header: str, mark: str) -> list[str]:
-    """The names in a header, in small letters, without units."""
-    return [name.strip("\"' \t").lower() for name in re.split(mark, UNITS.sub("", header))]
+        words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
+        numbered = words == list(map(str, range(len(words))))  # as pandas names an array's columns
+        if NUMBER.fullmatch(words[0]) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
+            return [*before], (number, line)
+        before.append(line[:LONGEST_HEADER])
+    return [*before], (0, "")
 
 
 def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
@@ -171,62 +144,76 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 
-def _names(header: str, is_comment: bool, table: np.ndarray, intensity_first: bool, report: Report) -> tuple[str, ...]:
-    """Names of the columns of a table from its header, or if that is a remark, from the numbers."""
-    count, names = table.shape[1], [""]
-    for mark in (*(mark for mark in ";," if mark in UNITS.sub("", header)), r"[\s,;]+"):
-        names = _split_names(header, mark)
-        while len(names) > count and not names[-1]:
+def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
+    """Names of the columns of a table by a line before it that names x, else by the numbers."""
+    count, filled = table.shape[1], 1 + int(np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2))
+    found: list[list[str]] = []
+    unfit: list[str] = []
+    for line in reversed(before):
+        text = UNITS.sub("", line.lstrip("#/% "))
+        mark = next((mark for mark in ";," if mark in text), None)
+        names = [name.strip("' \t").lower() for name in text.split(mark)]
+        while len(names) > filled and not names[-1]:
             names.pop()
-        if len(names) == count - 1 and "x" in names and len(table) > 1 and np.all(np.diff(table[:, 0]) == 1):
-            names.insert(0, "")  # as R writes a table
-        if len(names) == count:
-            break
-    known, fits = "x" in names, len(names) == count
-    if not (known and fits) and (is_comment or not (known or fits)):  # a remark
-        return plain_names(table, report, intensity_first)
-    if not fits:
-        raise UserError(f"names {len(names)} columns ({' '.join(names)}) above {count} columns of numbers")
-    return tuple(INDEX if not name or name in names[:number] else name for number, name in enumerate(names))
+        is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
+        if filled <= len(names) <= count and ("x" in names or not is_remark):
+            found.append(names)
+        elif "x" in names and not is_remark:
+            unfit = unfit or names
+    if names := next((names for names in found if "x" in names), [*found, []][0]):
+        names += [""] * (count - len(names))  # separators behind the last number
+        return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
+    if unfit:
+        raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers")
+    of_format = suffix == ".pts" and filled == 7
+    told = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
+    return (*told, *[INDEX] * (count - filled))
 
 
-def plain_names(table: np.ndarray, report: Report, intensity_first: bool = False) -> tuple[str, ...]:
-    """Names of the columns of a table (points, columns) that has none.
+def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
+    """Names of the columns of a table (points, columns) that has none: what stands behind x y z is told by its values.
 
-    `intensity_first` tells where both the first and the last three of four numbers could be a colour.
+    The first three that can be normals; of the others those three that are most alike of what can be colours.
     """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
-    steps = np.diff(table[:, 0].astype(np.float64)) if 3 < count < 11 and len(table) > 2 else np.zeros(1)
+    if count < 3 or count == 5 or count > MOST_COLUMNS:
+        raise UserError(
+            f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of x y z "
+            "and what may stand behind them (intensity, r g b, nx ny nz, roughness metallic), or a header line that "
+            "names the columns"
+        )
+    steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
     timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
     if timed or np.all(steps == 1):
         report("the first column, which grows steadily, taken as a number or a time of each point")
-        return (INDEX, *plain_names(table[:, 1:], report, intensity_first))
-    if count and (known := np.isfinite(table).all(axis=1)).any():
+        return (INDEX, *plain_names(table[:, 1:], report))
+    if (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
-    first = NORMAL if count in (6, 7, 9) and _are_normals(table[:, 3:6]) else COLOR
-    more = {3: (), 4: ("intensity",), 6: first, 8: (*COLOR, "roughness", "metallic")}
-    more[9] = (*first, *(NORMAL if first == COLOR else COLOR))
-    if count == 7:
-        last, starts, ends = table[:, 6], _are_colors(table[:, 3:6]), _are_colors(table[:, 4:])
-        share = table[:, 3:].min() >= 0 and table[:, 3:].max() <= 1 and np.median(last) == 1 and (last % 1).any()
-        color_first = first == NORMAL or (starts and not (ends and intensity_first))
-        more[7] = (*first, "scalar") if color_first else ("intensity", *COLOR)
-        more[7] = (*COLOR, "alpha") if share or (first == COLOR and np.isin(last, OPAQUE).all()) else more[7]
-    if count > 6 and count in more:
-        report(f"the {count} columns, which have no names, taken as {' '.join((*POSITION, *more[count]))}")
-    if count not in more:
-        raise UserError(
-            f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of 3, 4, "
-            "6, 7, 8 or 9 numbers (x y z; + intensity; + r g b; + r g b alpha; + r g b roughness metallic; + r g b and "
-            "nx ny nz), or a header line that names the columns"
-        )
-    return (*POSITION, *more[count])
+    names, threes = [*POSITION, *["scalar"] * (count - 3)], range(3, count - 2)
+    for i in [i for i in threes if _are_normals(table[:, i : i + 3], table[:, :3])][:1]:
+        names[i : i + 3] = NORMAL
+    free = [i for i in threes if names[i : i + 3] == 3 * ["scalar"]]
+    if colored := [i for i in free if _are_colors(table[:, i : i + 3])] or free:
+        start = max(colored, key=lambda i: _likeness(table[:, i : i + 3])) if len(table) > 2 else colored[0]
+        names[start : start + 3] = COLOR
+        rest, left = table[:, start + 3 :], count - start - 3
+        share = rest.min(initial=0) >= 0 and rest.max(initial=0) <= 1 and not np.all(rest % 1 == 0)
+        if left == 1 and (np.isin(rest, OPAQUE).all() or (share and table[:, 3:].max() <= 1 and np.median(rest) == 1)):
+            names[-1] = "alpha"
+        if left == 2 and share:
+            names[-2:] = "roughness", "metallic"
+    if names[3:4] == ["scalar"]:
+        names[3] = "intensity"
+    if count > 3:
+        report(f"the {count} columns, which have no names, taken as {' '.join(names)}")
+    return tuple(names)
 
 
-def _are_normals(vectors: np.ndarray) -> bool:
-    """Whether vectors (n, 3) have length 1, up to rounding, and are not all in the octant of colours."""
+def _are_normals(vectors: np.ndarray, positions: np.ndarray) -> bool:
+    """Whether vectors (n, 3) have length 1, up to rounding, and are not just colours: some below 0, or a plane's."""
     lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
-    return bool((vectors < 0).any() and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
+    plane = np.ptp(vectors, axis=0).max() == 0 and np.ptp(positions @ vectors[0]) < UNIT_LENGTH * np.ptp(positions)
+    return bool(((vectors < 0).any() or plane) and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
 
 
 def _are_colors(values: np.ndarray) -> bool:
@@ -234,6 +221,13 @@ def _are_colors(values: np.ndarray) -> bool:
     highest = values.max(axis=0)
     whole = highest.max() <= OPAQUE[-1] and np.all(values % 1 == 0)
     return bool(values.min() >= 0 and highest.min() >= highest.max() / 16 and (whole or highest.max() <= 1))
+
+
+@np.errstate(invalid="ignore")  # of a constant column
+def _likeness(values: np.ndarray) -> float:
+    """The smaller correlation of neighbouring columns of three (n, 3); 0 where one is constant."""
+    correlation = np.abs(np.corrcoef(values.T))
+    return max(0.0, round(float(np.min([correlation[0, 1], correlation[1, 2]])), 1))
 
 
 # --- NumPy ------------------------------------------------------------------------------------------------------------
@@ -245,29 +239,25 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            yield _name_columns(read_arrays(file, (*ARRAY_COLUMNS, *UNNAMED[1:]), report), report)
+            arrays = read_arrays(file, (*POINTS, *ARRAYS, *UNNAMED), report)
+            yield _archive_columns({plain_name(name): array for name, array in arrays.items()}, report)
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
     advice = "save arrays, as np.savez(file, points=..., colors=...)"
-    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), _parsing():
+    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), PARSER:
         rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    if rows.ndim == 3 and rows.dtype.kind in NUMBERS:
-        if min(rows.shape[:2]) > 1:
-            report(
-                f"an array of {' x '.join(map(str, rows.shape))} taken as one cloud; of a batch, save array[0] alone"
-            )
-        rows = rows.reshape(-1, rows.shape[2])
-    elif rows.dtype.names:
-        rows = rows.reshape(-1)
-    names = rows.dtype.names or plain_names(rows[:PIECE_LINES], report)
+    if rows.ndim == 3 and min(rows.shape[:2]) > 1:
+        report(f"an array of {' x '.join(map(str, rows.shape))} taken as one cloud; of a batch, save array[0] alone")
+    fields = rows.dtype.names
+    rows = rows.reshape(-1) if fields else rows.reshape(-1, rows.shape[2]) if rows.ndim == 3 else rows
+    names = fields or plain_names(rows[:PIECE_LINES], report)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
-        named = zip(names, [piece[name] for name in names] if rows.dtype.names else piece.T, strict=True)
-        yield {name.lower(): column for name, column in named if column.dtype.kind in NUMBERS + "b"}
+        yield name_columns({name: piece[name] if fields else piece[:, i] for i, name in enumerate(names)})
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
@@ -284,8 +274,8 @@ def read_arrays(
 
     `report` gets a line about the others.
     """
-    with refusing("is a broken or truncated NumPy file"), _parsing(), np.load(file, allow_pickle=False) as archive:
-        names = [name for name in archive.files if wanted is None or name in wanted]
+    with refusing("is a broken or truncated NumPy file"), PARSER, np.load(file, allow_pickle=False) as archive:
+        names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
         if (unpacked := sum(sizes[name] for name in names)) > MOST_BYTES:
             raise UserError(f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces")
@@ -296,36 +286,20 @@ def read_arrays(
     if others := [name for name in sizes if name not in names]:
         report(f"arrays that are not used: {list_names(others)}")
     if not arrays:
-        raise UserError(f"has none of the arrays {', '.join(wanted or ())}; found {', '.join(sizes) or 'none'}")
+        raise UserError(f"has none of the arrays {list_names([*(wanted or ())])}; found {', '.join(sizes) or 'none'}")
     return arrays
 
 
-@contextlib.contextmanager
-def _parsing() -> Iterator[None]:
-    """Headers are read by one thread at a time; NumPy warns of those of Python 2, which it reads well."""
-    with PARSER, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*required additional header parsing", UserWarning)
-        yield
-
-
-def _name_columns(archive: dict[str, np.ndarray], report: Report) -> Columns:
-    """The columns of arrays (points, c), or (points,) for scalars, under the names of ARRAY_COLUMNS."""
+def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
+    """The columns of arrays (points, c), or (points,) for scalars; of those without a name all that are as long."""
     columns: Columns = {}
-    if unnamed := [archive.pop(name) for name in UNNAMED if name in archive]:
-        first, *others = unnamed
-        shapes = [(len(first), width) for width in (3, 4)] if first.ndim == 2 and len(first) else []
-        tables = [array for array in others if array.shape in shapes and array.dtype.kind in NUMBERS]
-        beside = [table for table in tables if _are_colors(table[:, :3]) or _are_normals(table[:, :3])]
-        archive[UNNAMED[0]] = np.concatenate([first, *beside], axis=1) if beside else first
-    for name, array in archive.items():
-        targets, table = ARRAY_COLUMNS[name], array[:, None] if array.ndim == 1 else array
-        if targets == COLOR and table.shape[1:] == (4,):
-            targets = (*COLOR, "alpha")
-        if targets == POSITION and table.shape[1:] != (3,):
-            targets = plain_names(table, report)
-        if table.ndim != 2 or table.shape[1] != len(targets) or table.dtype.kind not in NUMBERS:
-            raise UserError(f"has {name!r} of shape {array.shape} and type {array.dtype}, not (points, {len(targets)})")
-        columns |= dict(zip(targets, table.T, strict=True))
+    if name := next((name for name in POINTS if name in arrays), None):
+        table = np.atleast_2d(arrays.pop(name))
+        unnamed = [arrays.pop(other) for other in UNNAMED if other in arrays]
+        beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
+        table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
+        columns = dict(zip(plain_names(table, report), table.T, strict=True))
+    columns |= name_columns(arrays)
     if len({len(column) for column in columns.values()}) > 1:
         raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
     return columns

@@ -17,7 +17,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import SRGB_TABLE, Loading, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import open_text
-from spnr_jax.formats.row_files import Lists, read_elements, read_ply_header
+from spnr_jax.formats.row_files import Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
@@ -29,7 +29,7 @@ OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     """The part of a PLY file with faces, or strips of them."""
     file = io.BytesIO(path.read_bytes())
-    header = read_ply_header(file)
+    header = read_header(file, ".ply")
     if (element := header.faces) is None:
         return []
     (vertices, _), (of_faces, lists) = read_elements(file, header, "vertex", element).values()
@@ -90,11 +90,9 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
         held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
         if announced > held:
             raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
-        if not announced:
-            loading.say(f"the header announces 0 triangles, {held} stand behind it: these are drawn")
-        elif held > announced:
-            more = held - announced
-            loading.say(f"the header announces {announced} triangles, {more} more stand behind them and are not read")
+        if held > announced:
+            read = announced or held
+            loading.say(f"the header announces {announced} triangles, {held} stand behind it, {read} are read")
         rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
         corners = rows["corners"]
         loading.ignored |= {"STL attribute bytes"} if rows["attribute"].any() else set()
@@ -117,19 +115,16 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     table = np.loadtxt(rows[:num_vertices], ndmin=2) if num_vertices else np.zeros((0, 3))
     columns = dict(zip(names, table.T, strict=False))
     faces = [[float(word) for word in row.split()] for row in rows[num_vertices:][:num_faces]]
-    if not faces:
-        loading.points = columns
-        return []
-    sizes = np.array([int(face[0]) for face in faces])
+    sizes = np.array([int(face[0]) for face in faces], np.int64)
     corners = [face[1 : 1 + size] for face, size in zip(faces, sizes, strict=True)]
     if [len(own) for own in corners] != sizes.tolist():
         raise UserError("is cut off: a face names fewer corners than it announces")
     behind = [face[1 + size :] for face, size in zip(faces, sizes, strict=True)]
-    colored = all(len(values) in (3, 4) for values in behind)
+    colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
         loading.ignored.add("colours of some faces alone")
-    return _colored(columns, np.concatenate(corners), sizes, of_faces, loading)
+    return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
@@ -141,7 +136,7 @@ def _colored(
     """The part of polygons of so many corners, with the colours of their vertices, else those of the polygons."""
     columns = useful(vertices)
     positions = stack_columns(columns)
-    if loose := len(positions) - len(np.unique(corners)):
+    if len(corners) and (loose := len(positions) - len(np.unique(corners))):
         loading.ignored.add(f"{loose:,} vertices of no face")
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None

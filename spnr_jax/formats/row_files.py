@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import Columns, Report
+from spnr_jax.formats.columns import ARRAYS, Columns, Report, list_names, name_columns, plain_name
+from spnr_jax.formats.gaussian_files import unpack_columns
 from spnr_jax.formats.point_tables import load_text
 
 Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
@@ -50,8 +51,7 @@ LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, les
 def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool) -> Iterator[tuple[Columns, Lists]]:
     """Columns and lists of `count` rows from the file's place on, some at a time.
 
-    Two to four numbers of one name are columns name:0, name:1 ..., as ParaView names them; more are none.  Rows whose
-    lists are as long as those of the first are read at once, others one by one.
+    Rows whose lists are as long as those of the first are read at once, others one by one.
     """
     lists, done = [name for name, _, width in properties if isinstance(width, str)], 0
     if not count or not properties:
@@ -84,26 +84,10 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
         done += wanted
 
 
-def report_further_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool, report: Report) -> None:
-    """A line about rows from the file's place on, behind the `count` that its header announces."""
-    held, begin = 0, file.tell()
-    if text:
-        held = sum(1 for _ in _lines(file))
-    elif not any(isinstance(width, str) for *_, width in properties):
-        held = (file.seek(0, SEEK_END) - begin) // max(1, _layout(properties, {})[0].itemsize)
-    if held:
-        report(f"the header announces {count:,} points, {held:,} more stand behind them and are not read")
-
-
 def _columns(properties: Properties, rows: Any) -> Columns:
     """The columns of rows, or of the values of properties by their names."""
-    columns: Columns = {}
-    for name, _, width in properties:
-        if width == 1:
-            columns[name] = rows[name]
-        elif width in (2, 3, 4):
-            columns |= {f"{name}:{i}": rows[name].reshape(-1, width)[:, i] for i in range(width)}
-    return columns
+    fields = [(name, width) for name, _, width in properties if not isinstance(width, str)]
+    return name_columns({name: rows[name].reshape(-1, width) for name, width in fields})
 
 
 def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, int]:
@@ -160,15 +144,17 @@ def _lines(file: BufferedIOBase) -> Iterator[str]:
     return (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
 
 
-# --- PLY --------------------------------------------------------------------------------------------------------------
+class Header(NamedTuple):
+    """What a PLY or PCD file announces: how its data is written; name, count and properties of its elements in order.
 
+    The points of both are an element `vertex`.
+    """
 
-class PlyHeader(NamedTuple):
-    """What a PLY file announces: whether its data is text, and name, count and properties of its elements in order."""
-
-    text: bool
+    encoding: str  # ascii, binary or binary_compressed
     elements: list[tuple[str, int, Properties]]
-    textures: list[str]  # names of files, by MeshLab's comments
+    textures: tuple[str, ...] = ()  # names of files, by MeshLab's comments
+    organised: bool = False  # one point for each pixel of a depth camera
+    sensor: tuple[float, ...] | None = None  # its place; writers put 0 0 0 there if they do not know it
 
     @property
     def faces(self) -> str | None:
@@ -176,8 +162,72 @@ class PlyHeader(NamedTuple):
         return next((name for name, count, _ in self.elements if name in FACES and count), None)
 
 
-def read_ply_header(file: BufferedIOBase) -> PlyHeader:
-    """The header of an open PLY file, which is left at its data."""
+def read_header(file: BufferedIOBase, kind: str) -> Header:
+    """The header of an open .ply or .pcd file, which is left at its data."""
+    return _ply_header(file) if kind == ".ply" else _pcd_header(file)
+
+
+def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
+    """The columns of the points of a .ply or .pcd file, some at a time; a line about rows behind those announced.
+
+    Compressed splats come whole.
+    """
+    with path.open("rb") as file:
+        header = read_header(file, kind)
+        if header.encoding == "binary_compressed":
+            yield _packed_columns(file.read(), *header.elements)
+            return
+        if any(field == "packed_position" for *_, properties in header.elements for field, *_ in properties):
+            found = read_elements(file, header, "chunk", "vertex")
+            yield unpack_columns(found["chunk"][0], found["vertex"][0])
+            return
+        for _, columns, lists in element_pieces(file, header, "vertex"):
+            fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}
+            if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
+                raise UserError(f"has lists of several lengths: {list_names([*fields])}")
+            yield columns | name_columns({name: x.reshape(len(sizes), -1) for name, (sizes, x) in fields.items()})
+        name, count, properties = header.elements[-1]
+        held, begin = 0, file.tell()
+        if name == "vertex" and header.encoding == "ascii":
+            held = sum(1 for _ in _lines(file))
+        elif name == "vertex" and not any(isinstance(width, str) for *_, width in properties):
+            held = (file.seek(0, SEEK_END) - begin) // max(1, _layout(properties, {})[0].itemsize)
+        if held:
+            report(f"the header announces {count:,} points, {held:,} more stand behind them and are not read")
+
+
+def element_pieces(file: BufferedIOBase, header: Header, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
+    """(name, columns, lists) of elements of a PLY file that is at its data, in its order, some rows at a time."""
+    left = set(wanted)
+    for name, count, properties in header.elements:
+        for columns, lists in read_rows(file, count, properties, header.encoding == "ascii") if left else ():
+            if name in left:
+                yield name, columns, lists
+        left -= {name}
+    if left:
+        names = ", ".join(name for name, _, _ in header.elements)
+        raise UserError(f"has no PLY element {min(left)!r}, only {names or 'none'}")
+
+
+def read_elements(file: BufferedIOBase, header: Header, *wanted: str) -> dict[str, tuple[Columns, Lists]]:
+    """All columns and lists of elements of a PLY file that is at its data."""
+    pieces, found = list(element_pieces(file, header, *wanted)), {}
+    for name in wanted:
+        own = [(columns, lists) for element, columns, lists in pieces if element == name]
+        joined = {
+            key: tuple(map(np.concatenate, zip(*(lists[key] for _, lists in own), strict=True))) for key in own[0][1]
+        }
+        found[name] = join_pieces(columns for columns, _ in own), joined
+    return found
+
+
+def join_pieces(pieces: Iterable[Columns]) -> Columns:
+    """The columns of all pieces in one; none if there are no pieces."""
+    first, *others = list(pieces) or [{}]
+    return {name: np.concatenate([first[name], *(piece[name] for piece in others)]) for name in first}
+
+
+def _ply_header(file: BufferedIOBase) -> Header:
     data = file.read(PLY_LIMIT)
     newline = re.search(rb"\r\n|\n|\r", data)
     # lines that end in \r alone may be followed by a byte of data that is a \n
@@ -208,55 +258,10 @@ def read_ply_header(file: BufferedIOBase) -> PlyHeader:
     file.seek(end.end())
     for _, _, own in elements:
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
-    return PlyHeader(order == "=", elements, textures)
+    return Header("ascii" if order == "=" else "binary", elements, tuple(textures))
 
 
-def element_pieces(file: BufferedIOBase, header: PlyHeader, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
-    """(name, columns, lists) of elements of a PLY file that is at its data, in its order, some rows at a time."""
-    left = set(wanted)
-    for name, count, properties in header.elements:
-        for columns, lists in read_rows(file, count, properties, header.text) if left else ():
-            if name in left:
-                yield name, columns, lists
-        left -= {name}
-    if left:
-        names = ", ".join(name for name, _, _ in header.elements)
-        raise UserError(f"has no PLY element {min(left)!r}, only {names or 'none'}")
-
-
-def read_elements(file: BufferedIOBase, header: PlyHeader, *wanted: str) -> dict[str, tuple[Columns, Lists]]:
-    """All columns and lists of elements of a PLY file that is at its data."""
-    pieces, found = list(element_pieces(file, header, *wanted)), {}
-    for name in wanted:
-        own = [(columns, lists) for element, columns, lists in pieces if element == name]
-        joined = {
-            key: tuple(map(np.concatenate, zip(*(lists[key] for _, lists in own), strict=True))) for key in own[0][1]
-        }
-        found[name] = join_pieces(columns for columns, _ in own), joined
-    return found
-
-
-def join_pieces(pieces: Iterable[Columns]) -> Columns:
-    """The columns of all pieces in one; none if there are no pieces."""
-    first, *others = list(pieces) or [{}]
-    return {name: np.concatenate([first[name], *(piece[name] for piece in others)]) for name in first}
-
-
-# --- PCD --------------------------------------------------------------------------------------------------------------
-
-
-class PcdHeader(NamedTuple):
-    """What a PCD file announces: a point's fields, how many points, and how they are written."""
-
-    properties: Properties
-    num_points: int
-    encoding: str
-    organised: bool  # one point for each pixel of a depth camera
-    sensor: tuple[float, ...] | None  # its place; writers put 0 0 0 there if they do not know it
-
-
-def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
-    """The header of an open PCD file, which is left at its data."""
+def _pcd_header(file: BufferedIOBase) -> Header:
     data = file.read(PCD_LIMIT)
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
     if end is None:
@@ -290,22 +295,14 @@ def read_pcd_header(file: BufferedIOBase) -> PcdHeader:
         place = tuple(map(float, entries.get("VIEWPOINT", [])[:3]))
         sensor = place if len(place) == 3 and all(map(math.isfinite, place)) else None
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
-    return PcdHeader([field for field in properties if field[2]], num_points, encoding, organised, sensor)
+    points = "vertex", num_points, [field for field in properties if field[2]]
+    return Header(encoding, [points], organised=organised, sensor=sensor)
 
 
-def pcd_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The fields of a PCD file as columns, some points at a time."""
-    with path.open("rb") as file:
-        header = read_pcd_header(file)
-        if header.encoding == "binary_compressed":
-            yield _packed_columns(file.read(), header)
-        else:
-            announced = header.num_points, header.properties, header.encoding == "ascii"
-            yield from (columns for columns, _ in read_rows(file, *announced))
-            report_further_rows(file, *announced, report)
+# --- compressed PCD ---------------------------------------------------------------------------------------------------
 
 
-def _packed_columns(body: bytes, header: PcdHeader) -> Columns:
+def _packed_columns(body: bytes, points: tuple[str, int, Properties]) -> Columns:
     """The columns of a compressed file, one field of all points after the other."""
     compressed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     packed = body[8 : 8 + compressed]
@@ -318,8 +315,8 @@ def _packed_columns(body: bytes, header: PcdHeader) -> Columns:
         if compressed != plain:
             raise
         stream = BytesIO(packed)  # some writers announce compressed data and store it as it is
-    for field in header.properties:
-        columns |= join_pieces(found for found, _ in read_rows(stream, header.num_points, [field], text=False))
+    for field in points[2]:
+        columns |= join_pieces(found for found, _ in read_rows(stream, points[1], [field], text=False))
     if stream.read(1):
         raise UserError(f"announces {plain} bytes of points, more than its header")
     return columns

@@ -98,6 +98,18 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
     return SurfacePoints(*(np.concatenate(columns)[:num_points] for columns in zip(*rounds, strict=True)))
 
 
+def vertex_points(asset: Asset) -> SurfacePoints:
+    """All vertices as points of face -1, with the mean of their material; normals are 0 where there are none."""
+    parts = []
+    for part in asset.parts:
+        look, shape = part.material, part.positions.shape
+        color = look.base_color.reshape(-1, 3).mean(axis=0) * (1 if part.colors is None else part.colors)
+        normals = np.zeros(shape) if part.normals is None else part.normals
+        scalars = (np.full(shape[0], np.mean(value)) for value in (look.roughness, look.metallic, -1))
+        parts.append(SurfacePoints(part.positions, normals, np.broadcast_to(color, shape), *scalars))
+    return SurfacePoints(*map(np.concatenate, zip(*parts, strict=True)))
+
+
 def face_areas(part: Part) -> np.ndarray:
     """Areas (f,) of a part's triangles."""
     return np.linalg.norm(face_crosses(part.positions, part.faces), axis=-1) / 2

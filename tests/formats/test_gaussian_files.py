@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from support import chromium as chromium_of
 from support import splat_balls, three_js
-from support.point_clouds import BALL, LINEAR, packed_splats, write
+from support.point_clouds import BALL, GREEN, LINEAR, packed_splats, write
 
 from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.surfels.gaussians import C0, rotation_matrices
 
@@ -74,6 +75,21 @@ def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
     cloud = read_cloud(write(tmp_path, "a.ply", content))
     np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
+    ranges = b"".join(
+        b"property float %s_%s\n" % (end, axis) for end in (b"min", b"max") for axis in (b"r", b"g", b"b")
+    )
+    boxes = np.tile(np.repeat(np.float32([-1, 1, 0.25, 0.75]), 3), 2).tobytes()  # of two chunks: places, then colours
+    content = content.replace(b"element vertex", ranges + b"element vertex")
+    content = content.replace(np.tile(np.repeat(np.float32([-1, 1]), 3), 2).tobytes(), boxes)
+    base_color = read_cloud(write(tmp_path, "a.ply", content)).base_color
+    np.testing.assert_allclose(base_color[0], srgb_to_linear(0.25 + np.array(GREEN) / 510), atol=2e-3)
+    for old, new, reason in (
+        (b"chunk 2", b"chunk 1", "compressed splats .index 1"),
+        (b"min_x", b"low_x", "compressed splats .there is no 'min_x'"),
+        (b"element chunk", b"element boxes", "no PLY element 'chunk', only boxes, vertex"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            read_cloud(write(tmp_path, "a.ply", content.replace(old, new)))
 
 
 # In three.js

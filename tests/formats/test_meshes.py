@@ -195,7 +195,7 @@ BROKEN = [  # text, library, words of the refusal
     *((PAINTED, f"newmtl paint\n{line}\n", "is transparent: material 'paint'") for line in TRANSPARENT),
     *((PAINTED, f"newmtl paint\n{line}\n", "not finite") for line in ("Kd nan 0 0", "Pm nan")),
     (PAINTED, "newmtl paint\nmap_Kd gone.png\n", "missing: 'gone.png'"),
-    (PAINTED, "newmtl paint\nmap_Kd ..\\gone.png\n", "outside its own folder"),
+    (PAINTED, "newmtl paint\nmap_Kd ..\\gone.png\n", "missing: '../gone.png'"),
     (PAINTED, "newmtl other\n", "'paint'"),
     (f"mtllib gone.mtl\n{VERTICES}f 1 2 3\n", None, "missing: 'gone.mtl'"),
     (VERTICES, None, "has no faces"),
@@ -287,7 +287,7 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
         np.testing.assert_allclose(values, expected, atol=0.01)
     assert asset.notes[0].startswith("plain values taken where it names a file that is missing: 'maps/color.png', ")
     asset = load_mesh(wood, transparent_parts="opaque")
-    assert asset.notes == ("plain values taken where it names a file outside its own folder: 'C:/maps/wood.png'",)
+    assert asset.notes == ("plain values taken where it names a file that is missing: 'C:/maps/wood.png'",)
     (tmp_path / "look.mtl").unlink()
     asset = load_mesh(wood, transparent_parts="opaque")
     assert "names a file that is missing: 'look.mtl'" in asset.notes[0]

@@ -212,7 +212,8 @@ def scenes() -> list[Files]:
     base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.9]}}
     moved = {"KHR_texture_transform": {"scale": [2, 3], "offset": [0.1, 0], "rotation": 0.3, "texCoord": 0}}
     bumpy = {"normalTexture": {"index": 1, "scale": 0.7, "extensions": moved}}
-    shiny = {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}, "glossinessFactor": 0.4}}
+    look = {"diffuseTexture": {"index": 0}, "specularGlossinessTexture": {"index": 1}}
+    shiny = {"KHR_materials_pbrSpecularGlossiness": look}
     glass = {"KHR_materials_transmission": {"transmissionFactor": 0.5}}
     return [
         scene(base | {"alphaMode": "MASK", "alphaCutoff": 0.3} | bumpy, *pictures),

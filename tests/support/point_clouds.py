@@ -34,16 +34,14 @@ def ply_bytes(form: str, newline: str = "\n", rows=ROWS, properties=VERTEX, befo
 
 def packed_splats(points: np.ndarray, color: int) -> bytes:
     """A compressed .ply of splats at points (n, 3) in [-1, 1], all of one colour 0xRRGGBBAA."""
-    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {-(-len(points) // 256)}\n"
+    chunks = -(-len(points) // 256)
+    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n"
     head += "".join(f"property float {end}_{axis}\n" for end in ("min", "max") for axis in "xyz")
     head += f"element vertex {len(points)}\n"
     head += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
-    share = np.round((points + 1) / 2 * [2047, 1023, 2047]).astype(np.uint32)
-    rows = np.zeros((len(points), 4), "<u4")
-    rows[:, 0] = share[:, 0] << 21 | share[:, 1] << 11 | share[:, 2]
-    rows[:, 3] = color
-    boxes = np.array(-(-len(points) // 256) * ([-1] * 3 + [1] * 3), "<f4")
-    return (head + "end_header\n").encode() + boxes.tobytes() + rows.tobytes()
+    x, y, z = np.round((points + 1) / 2 * [2047, 1023, 2047]).astype("<u4").T
+    rows = np.stack([x << 21 | y << 11 | z, 0 * x, 0 * x, np.full_like(x, color)], axis=1)
+    return (head + "end_header\n").encode() + np.array(chunks * ([-1] * 3 + [1] * 3), "<f4").tobytes() + rows.tobytes()
 
 
 def sphere_points(seed: int, num_points: int) -> np.ndarray:
