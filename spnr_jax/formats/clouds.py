@@ -183,7 +183,7 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     kept = np.arange(len(points.positions))
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
-        kept = np.sort(farthest_points(points.positions, count, how.seed))
+        kept = np.sort(farthest_points(points.positions, count, how.seed, points.values.get("normals")))
     positions, values, _ = points.take(kept)
     if "normals" not in values and sensor:
         values["normals"] = face_sensor(positions, points.positions, sensor.place - before, noise)
@@ -268,7 +268,7 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     count = max(CUT_MESH if how.cut.is_given else 0, how.num_points or MESH_POINTS)
     report(f"{count} points spread over the surface of the mesh")
-    return sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random"), origin
+    return sample_surface(asset, count, how.seed, "even" if count <= MOST_EVEN else "random", sides=True), origin
 
 
 def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:

@@ -93,7 +93,12 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
 
 def _columns(text: Rests) -> Columns:
     """The columns of the vertices: positions, and perhaps colours."""
-    table = _table(text["v"], None)
+    try:
+        table = _table(text["v"], None)
+    except ValueError as error:
+        if "number of columns" not in str(error):
+            raise
+        raise UserError("has vertices of different lengths: it is broken, or give colours to all of them") from None
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
     return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))

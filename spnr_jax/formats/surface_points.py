@@ -55,18 +55,21 @@ def normalise(asset: Asset) -> tuple[Asset, dict]:
     return replace(asset, parts=parts), {"centre": centre.tolist(), "scale": float(scale)}
 
 
-def sample_surface(asset: Asset, num_points: int, seed: int, spread: Spread = "random") -> SurfacePoints:
+def sample_surface(
+    asset: Asset, num_points: int, seed: int, spread: Spread = "random", sides: bool = False
+) -> SurfacePoints:
     """Points on all faces; the same seed gives the same points.
 
     Random ones are drawn uniformly by area.  Of an even spread each is the farthest of CANDIDATES times as many from
-    those before it, so that any first ones of them are spread evenly too, and thin parts have their share.
+    those before it, so that any first ones of them are spread evenly too, and thin parts have their share.  With
+    `sides`, those of each side of a thin wall are spread evenly by themselves.
     """
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
     if spread == "random":
         return _random_points(asset, num_points, seed)
     drawn = _random_points(asset, CANDIDATES * num_points, seed)
-    chosen = farthest_points(drawn.positions, num_points, seed)
+    chosen = farthest_points(drawn.positions, num_points, seed, drawn.normals if sides else None)
     return SurfacePoints(*(column[chosen] for column in drawn))
 
 

@@ -8,6 +8,8 @@ thinning    a random sample while reading, then voxels, then farthest-point samp
 """
 
 from collections.abc import Iterable
+from functools import reduce
+from operator import add
 
 import jax
 import numpy as np
@@ -201,6 +203,7 @@ INNER = (0.05, 0.95)  # quantiles along each axis that define the extent of a cl
 HALVINGS = 20  # of the extent, to the smallest voxel that is tried
 SMALLEST_EXTENT = 1e-30  # where all points coincide
 FARTHEST = 1e18  # distance from the middle, in the file's units, up to which squared distances fit float32
+BY_NORMAL = 0.6  # spacings by which a point is moved along its normal, on axes of their own, before distances are taken
 FIRST = 256  # farthest points that are searched among all points; later ones among few candidates
 FAR = 0.95  # of the largest squared distance: points above it are candidates for the farthest
 BEYOND = 1 + 1e-5  # factor on query radii that covers rounding in single precision
@@ -286,17 +289,21 @@ def candidates(positions: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([chosen, others]))
 
 
-def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
+def farthest_points(positions: np.ndarray, count: int, seed: int, normals: np.ndarray | None = None) -> np.ndarray:
     """Indices (count,) of points (n, 3), each the farthest from those before it; n >= count.
 
     So any prefix is evenly spread.  The seed chooses the first point; ties go to the first in the file.  Beyond
-    THINNING * count points, voxels thin them first: the time is close to count log count.
+    THINNING * count points, voxels thin them first: the time is close to count log count.  With normals (n, 3), of unit
+    length or 0, a distance includes the angle between them, so that both sides of a thin wall are covered evenly.
     """
     among = candidates(positions, count)
     centred = positions[among] - positions.mean(axis=0)
     largest = np.abs(centred).max(initial=0)
     if largest > FARTHEST:  # else the squares leave float32
         centred = centred / largest
+    if normals is not None and len(among) > 1:
+        spacing = measure_spacing(cKDTree(centred)) * float(np.sqrt(len(among) / count))
+        centred = np.concatenate([centred, BY_NORMAL * spacing * normals[among]], axis=1)
     columns = np.ascontiguousarray(centred.T, np.float32)
     squared = np.full(len(among), np.inf, np.float32)
     chosen = np.empty(count, np.int64)
@@ -312,9 +319,8 @@ def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
 
 
 def _squares(columns: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Squared distances (n,) of points, as columns (3, n), to a place (3,)."""
-    (x, y, z), (a, b, c) = columns, place
-    return (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
+    """Squared distances (n,) of points, as columns (d, n), to a place (d,)."""
+    return reduce(add, ((column - value) ** 2 for column, value in zip(columns, place, strict=True)))
 
 
 def _continue_farthest(chosen: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:

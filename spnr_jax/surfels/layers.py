@@ -102,7 +102,7 @@ class Constants:
     largest_radius: float = 4.0  # radius of a disc without an end
 
     # gaps between random points
-    even: float = 0.64  # evenness from which points are even: gaps are holes
+    even: float = 0.66  # evenness from which points are even: gaps are holes
     widest_gap: float = 2.2  # radius of the largest gap that is bridged
     duplicate_distance: float = 5e-7  # half the squared distance below which two points coincide
     gap_cover: float = 0.95  # distance to the middle of a gap, in spacings as enlarged, at most

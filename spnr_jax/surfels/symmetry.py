@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.surfels.geometry import measure_evenness, neighbors
 from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral
@@ -104,7 +105,7 @@ def complete(cloud: PointCloud) -> PointCloud:
     count = len(cloud.mask)
     if not FEWEST_POINTS <= count <= RANDOM.most_points:
         return cloud
-    evenness = measure_evenness(cloud)
+    evenness = float(measure_evenness(cloud, neighbors(cloud)))
     cloud = dataclasses.replace(cloud, evenness=np.full(count, evenness, np.float32))
     limits = choose_limits(evenness)
     if count > limits.most_points:
@@ -117,13 +118,6 @@ def complete(cloud: PointCloud) -> PointCloud:
     for number, plane in enumerate(chosen):
         cloud = add_reflected(cloud, measure_surface(cloud, limits) if number else surface, plane)
     return cloud
-
-
-def measure_evenness(cloud: PointCloud) -> float:
-    """`geometry.measure_evenness` on the host."""
-    distance = measure_distances(cKDTree(cloud.positions))[0][:, 1:7]
-    mean = distance.mean(axis=1)
-    return float(np.median(distance[:, 0] / np.where(mean > 0, mean, 1)))
 
 
 def choose_limits(evenness: float) -> Limits:

@@ -150,6 +150,18 @@ def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_pat
     assert nearest(301) < 0.2
 
 
+def test_thinning_covers_each_side_of_a_thin_wall_whose_normals_are_given(tmp_path):
+    front = np.arange(4000) % 2 == 0
+    wall = np.random.default_rng(1).random((4000, 3)) * [1, 1, 0] + front[:, None] * [0, 0, 0.004]
+
+    def widest_gap(**columns):
+        kept = read(write_rows(tmp_path, wall, **columns), num_points=400, clean="off")[0].positions
+        sides = [(kept[:, 2] > 0.002, front), (kept[:, 2] < 0.002, ~front)]
+        return max(cKDTree(kept[of_kept]).query(wall[of_all])[0].max() for of_kept, of_all in sides)
+
+    assert widest_gap(nx=0 * front, ny=0 * front, nz=2.0 * front - 1) < 0.7 * widest_gap()
+
+
 def test_thinning_keeps_points_of_the_file_with_their_materials_and_depends_on_the_seed_alone(tmp_path):
     positions = sphere_points(1, 900)
     np.savez(tmp_path / "a.npz", xyz=positions, normals=positions, roughness=np.arange(900) / 900)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from support.point_clouds import sphere_points
 
 from spnr_jax.kernels.cloud_arrays import (
@@ -9,9 +10,12 @@ from spnr_jax.kernels.cloud_arrays import (
     candidates,
     farthest_points,
     first_in_voxels,
+    plain_cloud,
     sample_stream,
     stack_columns,
 )
+from spnr_jax.surfels.geometry import measure_evenness, neighbors
+from spnr_jax.surfels.layers import CONSTANTS
 
 
 @pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before
@@ -24,6 +28,23 @@ def test_thinned_points_cover_the_shape_evenly_where_a_random_choice_leaves_gaps
     random_gap = np.linalg.norm(positions[:, None] - positions[random], axis=-1).min(axis=1)
     assert between.min() > 0.8 * np.quantile(gap, 0.99)  # a packing that covers: both radii agree
     assert np.quantile(gap, 0.99) < 0.6 * np.quantile(random_gap, 0.99)
+
+
+def test_with_normals_each_side_of_a_thin_wall_is_covered_by_itself_and_still_even():
+    places = np.random.default_rng(1).random((4000, 3)) * [1, 1, 0]
+    front = np.arange(4000) % 2 == 0
+    wall, normals = places + front[:, None] * [0, 0, 0.004], np.where(front[:, None], [0, 0, 1.0], [0, 0, -1.0])
+
+    def gap_and_evenness(kept):
+        gaps = [cKDTree(wall[kept[front[kept] == side]]).query(wall[front == side])[0].max() for side in (True, False)]
+        one = plain_cloud(np.float32(wall[kept]), normals=np.float32(normals[kept]))
+        return max(gaps), float(measure_evenness(one, neighbors(one)))
+
+    blind, told = (gap_and_evenness(farthest_points(wall, 400, 0, of)) for of in (None, normals))
+    assert told[0] < 0.7 * blind[0]
+    assert told[1] > CONSTANTS.even
+    unknown = farthest_points(wall, 400, 0, np.zeros_like(wall))
+    np.testing.assert_array_equal(unknown, farthest_points(wall, 400, 0))
 
 
 def in_a_grid(positions: np.ndarray) -> np.ndarray:

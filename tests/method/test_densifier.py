@@ -12,11 +12,10 @@ from support.laws import close
 from support.surfel_clouds import cloud, shape
 
 import spnr_jax
-from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.method import densifier, surfel_method
 from spnr_jax.method.densifier import CANDIDATES, Nodes, place_candidates
-from spnr_jax.surfels import symmetry
+from spnr_jax.surfels import geometry, symmetry
 from spnr_jax.training import weights
 
 COUNT, SIZE = 150, 512  # real points, and with padding; whole clouds have as many, so that they share programs
@@ -57,7 +56,8 @@ def test_measured_points_are_kept_as_they_are_and_learned_points_are_told(params
     assert (learned <= 1).all()
     assert COUNT < len(learned) - COUNT < 4 * COUNT
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
-    close(dense.evenness, np.full(len(dense.mask), symmetry.measure_evenness(cloud_arrays.strip(points))), rtol=1e-4)
+    evenness = geometry.measure_evenness(points, spnr_jax.neighbors(points))
+    close(dense.evenness, np.full(len(dense.mask), evenness), rtol=1e-4)
 
 
 def test_learned_points_lie_on_a_ball_nearer_than_the_middles_of_pairs(params):

@@ -48,11 +48,11 @@ def sparse(points, count=1000, spread="even", **columns):
 
 
 def surface_of(one) -> symmetry.Surface:
-    return symmetry.measure_surface(one, symmetry.choose_limits(symmetry.measure_evenness(one)))
+    return symmetry.measure_surface(one, symmetry.choose_limits(evenness_of(one)))
 
 
 def evenness_of(one) -> float:
-    return float(geometry.measure_evenness(one, jnp.asarray(geometry.neighbors(one))))
+    return float(geometry.measure_evenness(one, geometry.neighbors(one)))
 
 
 def stays_as_it_is(one) -> bool:
@@ -68,10 +68,11 @@ def spacing_of(one) -> float:
 @pytest.mark.parametrize(("spread", "expected"), [("even", 0.77), ("random", 0.53)])
 def test_the_evenness_is_that_of_the_program_in_any_units_and_kept_beside_added_points(spread, expected):
     one, _ = sparse(chair()[0], spread=spread)
-    found = symmetry.measure_evenness(one)
+    found = evenness_of(one)
     assert abs(found - expected) < 0.05
     for scale in (1e-4, 1.0, 1e4):
-        close(evenness_of(pad(dataclasses.replace(one, positions=scale * one.positions), 1024)), found, rtol=1e-4)
+        padded = pad(dataclasses.replace(one, positions=scale * one.positions), 1024)
+        close(geometry.measure_evenness(padded, jnp.asarray(geometry.neighbors(padded))), found, rtol=1e-4)
     more = symmetry.complete(one)
     assert len(more.mask) > len(one.mask)
     close(evenness_of(more), found)
