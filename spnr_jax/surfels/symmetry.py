@@ -107,7 +107,7 @@ def complete(cloud: PointCloud) -> PointCloud:
         return cloud
     evenness = float(measure_evenness(cloud, neighbors(cloud)))
     cloud = dataclasses.replace(cloud, evenness=np.full(count, evenness, np.float32))
-    limits = choose_limits(evenness)
+    limits = choose_limits(evenness, cloud.normals is not None)
     if count > limits.most_points:
         return cloud
     surface = measure_surface(cloud, limits)
@@ -120,9 +120,10 @@ def complete(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
-def choose_limits(evenness: float) -> Limits:
-    """The limits for points that lie so evenly."""
-    return RANDOM if evenness < CONSTANTS.even else EVENLY_SPREAD
+def choose_limits(evenness: float, normals_known: bool = False) -> Limits:
+    """The limits for points that lie so evenly; where normals are known, each side of a plate may do so by itself."""
+    limits = RANDOM if evenness < CONSTANTS.even else EVENLY_SPREAD
+    return limits._replace(plate=RANDOM.plate) if normals_known else limits
 
 
 def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:

@@ -48,7 +48,7 @@ def sparse(points, count=1000, spread="even", **columns):
 
 
 def surface_of(one) -> symmetry.Surface:
-    return symmetry.measure_surface(one, symmetry.choose_limits(evenness_of(one)))
+    return symmetry.measure_surface(one, symmetry.choose_limits(evenness_of(one), one.normals is not None))
 
 
 def evenness_of(one) -> float:
@@ -169,13 +169,21 @@ def test_a_cloud_without_symmetry_stays_as_it_is(spread):
     assert stays_as_it_is(one)
 
 
-def test_a_plate_is_not_reflected_in_its_middle():
+@pytest.mark.parametrize("spread", ["each side evenly", "random"])
+def test_a_plate_is_not_reflected_in_its_middle(spread):
     rng = np.random.default_rng(0)
-    inside = rng.uniform(size=(1000, 2))
-    inside = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside) * [1.5, 0.7]  # a scalene triangle
-    one = cloud(np.concatenate([inside, rng.choice([-0.005, 0.005], (1000, 1))], axis=1) - [0.5, 0.25, 0])
-    assert 0.5 * spacing_of(one) > 0.01
-    assert stays_as_it_is(one)
+    side = rng.choice([-1, 1], (9000, 1))
+    points, normals = (
+        np.concatenate([rng.uniform(size=(9000, 2)) * [1.5, 0.7], 0.005 * side], axis=1),
+        side * [0, 0, 1.0],
+    )
+    kept = farthest_points(points, 1000, 0, normals)
+    one = cloud(points[:1000]) if spread == "random" else cloud(points[kept], normals=normals[kept])
+    surface = surface_of(one)
+    assert 0.5 * surface.spacing > 0.01
+    planes = symmetry.find_planes(surface)
+    assert planes  # across the rectangle
+    assert all(abs(plane.normal[2]) < 0.1 for plane in planes)
 
 
 def test_reflected_points_fill_the_gaps_of_random_ones():
