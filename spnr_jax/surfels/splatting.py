@@ -1,14 +1,14 @@
-"""Surfels splatted to a G-buffer: the pixels that discs cover, and their order-independent blending by layers.
+"""Surfels splatted to a G-buffer: the pixels that discs cover, and their order-independent blending by groups.
 
     entry         a pair of a disc and a pixel that it covers (gsplat: intersection); entries are counted, made, and
                   sorted by pixel and depth
     kernel        1 - r^2, where r is the distance from the disc's centre in its plane, over RADIUS spacings; a disc
                   viewed edge-on or smaller than a pixel has a radius of MIN_RADIUS pixels (low-pass filter of EWA
                   splatting, Zwicker et al. 2001); an entry's optical depth is proportional to the square of the kernel
-    layers        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
+    groups        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
                   occlude each other; from two spacings on, the front entry occludes the one behind
-    blend weight  of an entry in its pixel: the weights of a layer add up to 1 - exp(-optical depth), times the
-                  transmittance before it; over all layers they add up to the opacity
+    blend weight  of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
+                  transmittance before it; over all groups they add up to the opacity
 
 Kernels fall to 0 at the rim of a disc, so a picture is continuous in the camera and in the points.  The pixels that a
 disc covers, and the order of the entries, are integers without a gradient.  Sizes are static; entries that do not fit
@@ -229,7 +229,7 @@ def _sort_entries(
 CENTRE_TAU = 3.0  # optical depth at the centre of a disc
 LIST_LENGTH = 24  # largest number of entries of a pixel
 COMPARED = 8  # entries on each side in the list that are compared in depth; those farther in front occlude
-THIN_TAU = 0.03  # optical depth of a layer below which its mean transmittance is a series
+THIN_TAU = 0.03  # optical depth of a group below which its mean transmittance is a series
 LEAST_OPACITY = 1e-4  # least summed blend weight that means are divided by
 SHARP_POWER = 4  # power of the kernel for the narrower weights that colours are blended with
 LEAST_WEIGHT = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
@@ -336,15 +336,15 @@ def compute_blend_weights(
 ) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"]]:
     """Blend weight of each entry, and the transmittance in front of it, for lists sorted by depth.
 
-    A layer of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
+    A group of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
     """
     return _blend_weights(tau, depth, spacing)
 
 
 def _plain_blend_weights(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
-    tau_before, tau_layer = _optical_depths(tau, depth, spacing)
+    tau_before, tau_group = _optical_depths(tau, depth, spacing)
     transmittance = jnp.exp(-tau_before)
-    return tau * transmittance * _mean_transmittance(tau_layer)[0], transmittance
+    return tau * transmittance * _mean_transmittance(tau_group)[0], transmittance
 
 
 def _pull_back_blend_weights(
@@ -356,22 +356,22 @@ def _pull_back_blend_weights(
     """
     tau, depth, spacing = primals
     by_weight, by_transmittance = cotangents
-    tau_before, tau_layer = _optical_depths(*primals)
-    transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_layer)
-    by_layer = by_weight * (tau * transmittance * slope)
+    tau_before, tau_group = _optical_depths(*primals)
+    transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_group)
+    by_group = by_weight * (tau * transmittance * slope)
     by_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
-    by_tau = by_weight * (transmittance * mean) + by_layer
+    by_tau = by_weight * (transmittance * mean) + by_group
     by_tau += jnp.matmul(_far_in_front(len(tau)).T, by_before, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
-    by_layer, by_before = map(jax.lax.optimization_barrier, (by_layer, by_before))  # one would be linear in all
-    known = tau, depth, spacing, by_layer, by_before
-    for step, (other_tau, *places, other_by_layer, other_by_before) in _shift_lists(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
+    by_group, by_before = map(jax.lax.optimization_barrier, (by_group, by_before))  # one would be linear in all
+    known = tau, depth, spacing, by_group, by_before
+    for step, (other_tau, *places, other_by_group, other_by_before) in _shift_lists(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
         gap, middle = _measure_gap(step, depth, spacing, *places)
         x = clamp(gap - 1, 0, 1)
         apart, slope = x * x * (3 - 2 * x), 6 * x * (1 - x)
-        by_tau += other_by_layer * (1 - apart) + (other_by_before * apart if step > 0 else 0)
+        by_tau += other_by_group * (1 - apart) + (other_by_before * apart if step > 0 else 0)
         through = tau * other_by_before if step > 0 else other_tau * by_before  # the front entry occludes the other
-        by_gap = slope * (through - other_tau * by_layer - tau * other_by_layer)
+        by_gap = slope * (through - other_tau * by_group - tau * other_by_group)
         by_depth += np.sign(-step) * by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
     return by_tau, by_depth, by_spacing
@@ -381,14 +381,14 @@ _blend_weights = numerics.with_gradient(_plain_blend_weights, _pull_back_blend_w
 
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
-    """Optical depth in front of each entry's layer, and that of the layer."""
-    tau_before, tau_layer = jnp.matmul(_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
+    """Optical depth in front of each entry's group, and that of the group."""
+    tau_before, tau_group = jnp.matmul(_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
     for step, (other_tau, *places) in _shift_lists((tau, depth, spacing), (0.0, 0.0, 1.0)):
         apart = smoothstep(_measure_gap(step, depth, spacing, *places)[0] - 1)
-        tau_layer += other_tau * (1 - apart)
+        tau_group += other_tau * (1 - apart)
         if step < 0:
             tau_before += other_tau * apart
-    return tau_before, tau_layer
+    return tau_before, tau_group
 
 
 def _far_in_front(length: int) -> Array:
@@ -417,7 +417,7 @@ def _measure_gap(
 
 
 def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
-    """(1 - exp(-tau)) / tau of a layer, and its derivative; a series for small tau, where all digits would cancel."""
+    """(1 - exp(-tau)) / tau of a group, and its derivative; a series for small tau, where all digits would cancel."""
     thin = tau < THIN_TAU
     thick = jnp.where(thin, 1, tau)
     mean = jnp.where(thin, 1 - tau * (1 / 2 - tau * (1 / 6 - tau / 24)), one_minus_exp(thick) / thick)
