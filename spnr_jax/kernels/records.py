@@ -16,6 +16,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
+TABLES = (7, 32, 64, 3)  # shape of a light's tables
 LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
 
 
@@ -190,10 +191,12 @@ class Light:
 
 
 def check_light(light: Light | None) -> None:
-    """ValueError unless it is a light, or None."""
+    """ValueError unless it is one light, or None."""
     if light is not None and not isinstance(light, Light):
         kind = type(light).__name__
         raise UserError(f"light: expected a Light, as spnr_jax.read_light('studio') or light_of(map), got {kind}")
+    if light is not None and np.shape(light.tables) != TABLES:
+        raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 
 
 @no_type_check

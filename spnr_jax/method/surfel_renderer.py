@@ -213,7 +213,6 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
         ("camera.intrinsics", camera.intrinsics, (3, 3)),
         ("scene.centre", scene.centre, (3,)),
         ("scene.surfels.position", scene.surfels.position, (*np.shape(scene.surfels.mask), 3)),
-        *(() if light is None else (("light.tables", light.tables, (7, lighting.HEIGHT, lighting.WIDTH, 3)),)),
     ):
         if np.shape(array) != wanted:
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")

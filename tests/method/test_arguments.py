@@ -22,6 +22,7 @@ CALLS = {
     "render(None, cloud, camera, plan=None)": "render: expected a scene of spnr_jax.encode",
     "model.encode(jax.tree.map(lambda x: x[None], cloud))": "encode: cloud.mask has the shape (1, 9)",
     "model.render(None, camera, light='studio')": "light: expected a Light",
+    "model.render(None, camera, light=jax.tree.map(lambda x: x[:6], light))": "light.tables has the shape (6, 32",
     "model.camera(scene, resolution=0)": "resolution must be at least 1 pixel, got 0",
     "light * light": "unsupported operand type",
     "spnr_jax.light_of(np.ones((64, 64, 3)))": "light_of: expected a map (height, 2 height, 3), got (64, 64, 3)",
