@@ -245,8 +245,12 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
     advice = "save arrays, as np.savez(file, points=..., colors=...)"
-    with refusing(f"is a broken, truncated or pickled NumPy file: {advice}"), PARSER:
-        rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
+    broken = f"is a broken, truncated or pickled NumPy file: {advice}"
+    try:
+        with refusing(broken), PARSER:
+            rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
+    except MemoryError:  # of Python's parser: the header is nested too deeply
+        raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
     if rows.ndim == 3 and min(rows.shape[:2]) > 1:

@@ -432,6 +432,11 @@ REFUSED = [
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
     ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
+    (
+        "a.npy",
+        b"\x93NUMPY\x02\x00" + (9001).to_bytes(4, "little") + b"~" * 9000 + b"1",
+        "a broken, truncated or pickled",
+    ),
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
     ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
