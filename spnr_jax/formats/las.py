@@ -99,10 +99,15 @@ def _check_sizes(content: mmap.mmap) -> int:
         raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
     place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)
     held = 0 if layered or chunk_size == VARIABLE else (chunks - 1) * chunk_size + 1  # the last one may be shorter
-    for _ in range(chunks if layered else 0):
+    for number in range(chunks if layered else 0):
         count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
         held += count
         if place > len(content) or count > LARGEST_CHUNK:
             raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
+        # lazrs would take what stands in the middle of a chunk for the next one
+        if chunk_size != VARIABLE and not (count == chunk_size or (count < chunk_size and number == chunks - 1)):
+            raise UserError(f"is broken: a chunk of {count} points where each has {chunk_size}")
+    if layered and held < points:
+        raise UserError(f"is cut off: its header announces {points} points, its chunks hold {held}")
     return max(0, held - points)

@@ -320,6 +320,7 @@ def test_the_lowest_intensity_is_no_missing_colour(tmp_path):
         (".las", 0, 0, "not a LAS file"),
         (".laz", "table", 2**31, "chunks in"),
         (".laz", "table", 0, "points in 0 chunks"),
+        (".laz", 247, 13, "announces 13 points, its chunks hold 12"),
     ],
 )
 def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffix, place, value, reason, tmp_path):
@@ -333,6 +334,17 @@ def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffi
     (tmp_path / f"a{suffix}").write_bytes(content)
     with pytest.raises(ValueError, match=reason):
         read_cloud(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("size", [4, 6])
+def test_chunks_of_other_sizes_than_announced_never_reach_the_library(size, tmp_path):
+    as_scan(tmp_path / "a.las", WHOLE, 7)
+    in_own_chunks(tmp_path / "a.las", (5, 5, 2), 5)
+    content = bytearray((tmp_path / "a.laz").read_bytes())
+    content[content.index(b"laszip encoded") + 64] = size
+    (tmp_path / "a.laz").write_bytes(content)
+    with pytest.raises(ValueError, match=f"a chunk of 5 points where each has {size}"):
+        read_cloud(tmp_path / "a.laz")
 
 
 @pytest.mark.parametrize(
