@@ -23,6 +23,7 @@ from spnr_jax.formats.columns import Columns, Report
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
+CHUNKED_LAYERS = 3  # the compressor of layered points
 LARGEST_CHUNK = 2**24  # points; writers use 50,000
 VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
 PIECE_BYTES = 2**23  # of points in memory at a time
@@ -80,9 +81,11 @@ def _check_sizes(content: mmap.mmap) -> int:
         place += RECORD_HEAD + size
     else:
         raise UserError("has no record that says how its points are compressed")
-    chunk_size, count = struct.unpack_from("<I16xH", content, place + RECORD_HEAD + 12)
+    compressor, chunk_size, count = struct.unpack_from("<H10xI16xH", content, place + RECORD_HEAD)
     items = [struct.unpack_from("<HH", content, place + RECORD_HEAD + 34 + 6 * i) for i in range(count)]
     layered = any(kind in LAYERS for kind, _ in items)
+    if layered and compressor != CHUNKED_LAYERS:
+        raise UserError(f"is broken: points in layers, and {compressor} as the way in which they are compressed")
     if layered and not chunk_size:
         chunk_size = VARIABLE  # as writers of COPC put it
     (table,) = struct.unpack_from("<q", content, data)
