@@ -387,7 +387,7 @@ def _check_values(points: Points, report: Report) -> None:
             near = cKDTree(positions[~black]).query(positions[black], 3)[1]
             values["base_color"] = values["base_color"].copy()
             values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
-    thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / measure_spacing(tree)
+    thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / max(measure_spacing(tree), 1e-300)
     if THIN[0] < thickness < THIN[1]:
         report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
     if "normals" in values and (reason := _doubt(positions, values["normals"])):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import array_namespace, clamp, larger, safe_sqrt, smaller, split_columns
-from spnr_jax.kernels.records import AnyArray, Light, Surfels
+from spnr_jax.kernels.records import TABLES, AnyArray, Light, Surfels
 from spnr_jax.surfels.sides import DIRECTIONS
 
 # --- maps as arrays ---------------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def _overlap(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 # --- light ------------------------------------------------------------------------------------------------------------
 
 
-HEIGHT, WIDTH = 32, 64  # of a table
+HEIGHT, WIDTH = TABLES[1:3]  # of a table
 ROOM = "room_light.npz"
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # roughnesses
 BLUR_LEVEL = 2  # index in LEVELS: this blurred table is sampled at the 64 visibility directions

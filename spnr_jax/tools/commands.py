@@ -255,7 +255,7 @@ class Export:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
-        given = [f"--{name}" for name in ("network", "up", "clean") if getattr(self, name) != getattr(type(self), name)]
+        given = [name for name in changed_options(self) if name in ("--network", "--up", "--clean")]
         given += [*changed_options(self.lighting), *changed_options(self.making)]
         require(self.splats is not None or not given, f"{''.join(given[:1])} is for --splats FILE, which is not given")
         at_white = self.lighting.background == "white"

@@ -169,8 +169,17 @@ def test_a_cloud_without_symmetry_stays_as_it_is(spread):
     assert stays_as_it_is(one)
 
 
+def test_a_plate_is_not_reflected_in_its_middle():
+    rng = np.random.default_rng(0)
+    inside = rng.uniform(size=(1000, 2))
+    inside = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside) * [1.5, 0.7]  # a scalene triangle
+    one = cloud(np.concatenate([inside, rng.choice([-0.005, 0.005], (1000, 1))], axis=1) - [0.5, 0.25, 0])
+    assert 0.5 * spacing_of(one) > 0.01
+    assert stays_as_it_is(one)
+
+
 @pytest.mark.parametrize("spread", ["each side evenly", "random"])
-def test_a_plate_is_not_reflected_in_its_middle(spread):
+def test_a_plate_is_reflected_across_and_not_in_its_middle(spread):
     rng = np.random.default_rng(0)
     side = rng.choice([-1, 1], (9000, 1))
     points, normals = (
