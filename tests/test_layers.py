@@ -66,8 +66,7 @@ def test_importing_the_package_is_light_and_its_kernels_are_one_module_under_bot
 def test_a_picture_needs_neither_the_paper_s_network_nor_what_trains_or_compares():
     code = (
         "import numpy as np, spnr_jax; spnr_jax.read_cloud; model = spnr_jax.load(); points = np.eye(3, dtype='f'); "
-        "cloud = spnr_jax.PointCloud(positions=points, base_color=points, roughness=points[0], metallic=points[0], "
-        "mask=np.ones(3, bool)); volume = model.encode(cloud, densify=False); "
+        "volume = model.encode(spnr_jax.make_cloud(points, points), densify=False); "
         "model.render(volume, model.camera(volume, resolution=16), 'draft')"
     )
     loaded = modules_after(code)

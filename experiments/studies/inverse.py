@@ -40,6 +40,7 @@ from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import cameras
+from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, FIELD_OF_VIEW
@@ -151,11 +152,10 @@ def shapes(options: InverseStudy) -> dict[str, PointCloud]:
     }
     clouds: dict[str, PointCloud] = {}
     for name, (radius, y) in list(outlines.items())[: 2 if options.quick else 4]:
-        positions = np.stack([radius * np.sin(2 * np.pi * u), y, radius * np.cos(2 * np.pi * u)], -1).astype(np.float32)
-        color = (0.5 + 0.35 * np.sin(5 * positions + len(clouds) + np.arange(3))).astype(np.float32)
-        smooth = np.where(y > 0, np.float32(0.3), np.float32(0.7))
-        metal = np.where((y > 0) & (u > 0.5), np.float32(0.8), np.float32(0))
-        clouds[name] = PointCloud(positions, color, smooth, metal, np.ones(count, bool))
+        positions = np.stack([radius * np.sin(2 * np.pi * u), y, radius * np.cos(2 * np.pi * u)], axis=-1)
+        color = 0.5 + 0.35 * np.sin(5 * positions + len(clouds) + np.arange(3))
+        smooth, metal = np.where(y > 0, 0.3, 0.7), np.where((y > 0) & (u > 0.5), 0.8, 0)
+        clouds[name] = make_cloud(positions, color, smooth, metal)
     return clouds
 
 

@@ -36,7 +36,7 @@ from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.data_sets import Dataset, ObjectData
-from spnr_jax.kernels.cloud_arrays import plain_cloud
+from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures
@@ -166,8 +166,8 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
 def ball(count: int, seed: int = 0) -> PointCloud:
     """Random points of a grey ball: its picture should be smooth."""
     towards = np.random.default_rng(seed).standard_normal((count, 3))
-    towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
-    return plain_cloud(towards, GREY, towards)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return make_cloud(towards, GREY, roughness=0.5, normals=towards)
 
 
 def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
@@ -189,7 +189,7 @@ def plate(count: int, seed: int = 0) -> PointCloud:
     normals = np.zeros((count, 3), np.float32)
     normals[np.arange(count), axis] = 2 * sign
     color = np.where((side == 0)[:, None], [0.8, 0.05, 0.05], [0.05, 0.05, 0.8])
-    return plain_cloud((places * PLATE).astype(np.float32), color.astype(np.float32), normals)
+    return make_cloud(places * PLATE, color, roughness=0.5, normals=normals)
 
 
 def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:

@@ -16,6 +16,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
 from spnr_jax.formats.assets import decode_image
+from spnr_jax.formats.camera_files import cameras_of
 from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
@@ -99,17 +100,11 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
 
     try:
         meta = json.loads(read(file))
-        with np.errstate(over="ignore"):  # what leaves float32 is infinite, and refused
-            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float32)[:, :3]
-            intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], np.float32)
+        cameras = cameras_of(meta)
+        camera = jax.tree.map(lambda *views: np.stack(views), *cameras)  # ValueError if their sizes differ
         names = [Path(frame["file_path"]).name for frame in meta["frames"]]
-        height, width = int(meta["h"]), int(meta["w"])
-        if poses.shape[1:] != (3, 4) or not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
-            raise UserError("a camera holds NaN or infinity, or is no 4 x 4 matrix")
-        if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
-            raise UserError(f"focal lengths {meta['fl_x']} and {meta['fl_y']}, expected positive ones")
-        images = np.stack([_rgba(read(file := f"images/{name}"), height, width) for name in names])
-        conditions = np.stack([_rgba(read(file := f"conditions/{name}"), height, width) for name in names])
+        images = np.stack([_rgba(read(file := f"images/{name}"), camera) for name in names])
+        conditions = np.stack([_rgba(read(file := f"conditions/{name}"), camera) for name in names])
         cloud = clouds.cloud_of_ply(read(file := "points.ply"))
         lights = _lights(read(file := "lights.npz"), len(names)) if has_lights(dataset) else None
     except Exception as error:
@@ -118,9 +113,6 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
         raise UserError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
-    camera = Camera(
-        cam_to_world=poses, intrinsics=np.broadcast_to(intrinsics, (len(names), 3, 3)), height=height, width=width
-    )
     return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions, lights=lights)
 
 
@@ -137,10 +129,11 @@ def _lights(content: bytes, views: int) -> np.ndarray:
     return lights
 
 
-def _rgba(content: bytes, height: int, width: int) -> np.ndarray:
-    image = decode_image(content)
-    if image.shape[:2] != (height, width):
-        raise UserError(f"{image.shape[1]} x {image.shape[0]} pixels, transforms.json says {width} x {height}")
+def _rgba(content: bytes, camera: Camera) -> np.ndarray:
+    image, sides = decode_image(content), (camera.width, camera.height)
+    if image.shape[1::-1] != sides:
+        found, said = (f"{width} x {height}" for width, height in (image.shape[1::-1], sides))
+        raise UserError(f"{found} pixels, transforms.json says {said}")
     return image
 
 

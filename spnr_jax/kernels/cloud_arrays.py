@@ -10,6 +10,7 @@ thinning    a random sample while reading, then voxels, then farthest-point samp
 from collections.abc import Iterable
 from functools import reduce
 from operator import add
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,7 +20,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.numerics import array_namespace
+from spnr_jax.kernels.records import AnyArray, PointCloud
 
 SMALLEST_BUCKET = 512
 VECTORS = ("positions", "base_color", "normals")  # fields of a cloud with three numbers a point
@@ -76,20 +78,38 @@ def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
     return ((low + high) / 2).astype(np.float32), np.float32(2 / diagonal if diagonal > 0 else 1)
 
 
-def plain_cloud(
-    positions: Float[np.ndarray, "points 3"],
-    base_color: Float[np.ndarray, "points 3"] | float = 0.5,
-    normals: Float[np.ndarray, "points 3"] | None = None,
+def make_cloud(
+    positions: Float[AnyArray, "points 3"],
+    base_color: Float[AnyArray, "points 3"] | Float[AnyArray, "3"] | tuple[float, float, float] | float = 0.5,
+    roughness: Float[AnyArray, " points"] | float | None = None,
+    metallic: Float[AnyArray, " points"] | float | None = None,
+    normals: Float[AnyArray, "points 3"] | None = None,
 ) -> PointCloud:
-    """Points of one material, grey by default, with roughness 0.5 and metallic 0; none is padding."""
-    count = len(positions)
+    """The cloud of these arrays, without padding; one value holds for all points.  Pure; NumPy or JAX.
+
+    Base colours are linear.  Without roughness and metallic, 0.5 and 0 are taken and marked as unknown.  Normals have
+    any length, 0 where unknown.  Files of points say more (`read_cloud`): for arrays nothing is merged or cleaned.
+    ValueError for shapes that do not fit.
+    """
+    xp = array_namespace(positions, base_color, roughness, metallic, normals)
+    if len(shape := np.shape(positions)) != 2 or shape[1] != 3:
+        raise UserError(f"make_cloud: positions has the shape {shape}, expected (points, 3)")
+    kind = np.float32 if xp is np else xp.promote_types(xp.asarray(positions).dtype, np.float32)
+
+    def column(name: str, values: Any) -> AnyArray:
+        wanted = shape if name in VECTORS else shape[:1]
+        if np.shape(values) not in (wanted, wanted[1:], ()):
+            raise UserError(f"make_cloud: {name} has the shape {np.shape(values)}, expected {wanted}")
+        return xp.broadcast_to(xp.asarray(values, kind), wanted)
+
     return PointCloud(
-        positions=positions,
-        base_color=np.broadcast_to(np.float32(base_color), (count, 3)),
-        roughness=np.full(count, 0.5, np.float32),
-        metallic=np.zeros(count, np.float32),
-        mask=np.ones(count, bool),
-        normals=normals,
+        positions=column("positions", positions),
+        base_color=column("base_color", base_color),
+        roughness=column("roughness", 0.5 if roughness is None else roughness),
+        metallic=column("metallic", 0.0 if metallic is None else metallic),
+        mask=xp.ones(shape[0], bool),
+        normals=None if normals is None else column("normals", normals),
+        materials_known=column("materials_known", 0.0) if roughness is None and metallic is None else None,
     )
 
 

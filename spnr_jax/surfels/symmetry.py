@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.triangles import unit
 from spnr_jax.surfels.geometry import measure_evenness, neighbors
 from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.normals import estimate_normals
@@ -131,7 +132,9 @@ def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:
     position = np.asarray(cloud.positions, np.float64)
     tree = cKDTree(position)
     _, around, spacing = measure_distances(tree)
-    normal = estimate_normals(position, position) if cloud.normals is None else np.asarray(cloud.normals, np.float64)
+    normal = (
+        estimate_normals(position, position) if cloud.normals is None else unit(np.asarray(cloud.normals, np.float64))
+    )
     return Surface(position, normal, spacing, limits, around, tree)
 
 

@@ -141,6 +141,9 @@ class Render(ReadOptions):
     """Seed of the chosen points, and of the planes that --remove-plane tries."""
     views: int = 4
     """Stills, at even angles around the object."""
+    cameras: Path | None = None
+    """Cameras of the stills instead of those around the object: a transforms.json of NeRF or nerfstudio, in the frame
+    of the cloud's file, or a NAME_cameras.json that this command wrote."""
     elevation: float = 20.0
     """Degrees above the horizon."""
     resolution: int | None = None
@@ -177,6 +180,8 @@ class Render(ReadOptions):
         names = [cloud.stem for cloud in (self.cloud, *self.others)]
         require(len(set(names)) == len(names), "two clouds have one name; give them an --out each")
         require_at_least(self, 0, "views")
+        own = "--views" in changed_options(self)
+        require(self.cameras is None or not own, "--views: not together with --cameras FILE; give one of them")
         require(len(self.outputs) > 0, "--outputs: expected one or more of image, depth, opacity")
         require(self.views > 0 or self.turntable != "none", "--views 0 --turntable none: nothing is left to draw")
         require_at_least(self, 1, "frames", "fps")

@@ -44,7 +44,7 @@ from spnr_jax.errors import UserError, require
 from spnr_jax.formats import images
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
 from spnr_jax.formats.point_tables import pack_arrays
-from spnr_jax.kernels.cloud_arrays import plain_cloud
+from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
@@ -288,7 +288,7 @@ def nearest(positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " point
 
 def make_plan(model: Model, num_points: int, size: int) -> Plan:
     """Sizes, with a margin, for pictures of any object of `num_points` points by `Model.camera`."""
-    ball = plain_cloud(np.asarray(RADIUS * spiral(num_points), np.float32))
+    ball = make_cloud(RADIUS * spiral(num_points), roughness=0.5)
     scene = surfel_method.encode_in_box(ball)
     plan = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
     side = surfel_renderer.round_up(-(-size * plan.side // 2**plan.doublings) + surfel_renderer.MARGIN)

@@ -28,6 +28,7 @@ from PIL import Image
 from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
+from spnr_jax.formats.camera_files import describe_cameras, read_cameras
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
@@ -82,12 +83,13 @@ INVISIBLE = 1 / 255  # opacity below which a pixel has no colour of its own
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedObject:
-    """An encoded cloud, and the model and light that render it."""
+    """An encoded cloud, the model and light that render it, and cameras of a file, if there are any."""
 
     placed: PlacedCloud
     model: Model
     volume: Volume
     light: Light | None
+    cameras: Sequence[Camera] = ()
 
 
 def render_file(options: Render, note: Callable[[str], None]) -> Iterator[str]:
@@ -105,6 +107,8 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
     """
     model = load(options.run)
     check_takes_light(model, options.light_options_given, options.run)
+    if options.cameras:  # before the cloud is read, which takes time
+        read_cameras(options.cameras, report=lambda line: note(f"{options.cameras}: {line}"))
     light = light_of_options(options.lighting) if options.light_options_given else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -116,7 +120,9 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    return PreparedObject(placed=placed, model=model, volume=model.encode(placed.cloud, options.densify), light=light)
+    cameras = read_cameras(options.cameras, rotation=placed.rotation, origin=placed.origin) if options.cameras else ()
+    volume = model.encode(placed.cloud, options.densify)
+    return PreparedObject(placed=placed, model=model, volume=volume, light=light, cameras=cameras)
 
 
 def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Callable[[], str]]:
@@ -141,7 +147,9 @@ View = tuple[Camera, Light | None]
 
 
 def still_views(ready: PreparedObject, options: Render) -> list[View]:
-    """Cameras evenly around the object, and its light."""
+    """The cameras of the file, or some evenly around the object, and its light."""
+    if ready.cameras:
+        return [(camera, ready.light) for camera in ready.cameras]
     turns = np.arange(options.views) * 360 / max(options.views, 1)
     return [(_camera(ready, FIRST_AZIMUTH + turn, options), ready.light) for turn in turns]
 
@@ -204,32 +212,12 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
 
 def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:
     """The views in the nerfstudio convention, and the transform of the points: box = scale * (rotation p - centre)."""
-    camera = cameras[0]
-    intrinsics, scale = np.asarray(camera.intrinsics, np.float64), float(volume.scale)
-    return {
-        "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": intrinsics[0, 0],
-        "fl_y": intrinsics[1, 1],
-        "cx": intrinsics[0, 2],
-        "cy": intrinsics[1, 2],
-        "frames": [
-            {"file_path": f"{name}_{i:03d}.png", "transform_matrix": _pose_in_file(camera, placed).tolist()}
-            for i, camera in enumerate(cameras)
-        ],
+    names = [f"{name}_{i:03d}.png" for i in range(len(cameras))]
+    return describe_cameras(cameras, names, placed.rotation, placed.origin) | {
         "up": placed.up,
         "normalization": {
             "rotation": placed.rotation.tolist(),
             "centre": (np.asarray(volume.centre, np.float64) + placed.rotation @ placed.origin).tolist(),
-            "scale": scale,
+            "scale": float(volume.scale),
         },
     }
-
-
-def _pose_in_file(camera: Camera, placed: PlacedCloud) -> np.ndarray:
-    """Camera-to-world matrix (4, 4) in the frame of the file."""
-    pose = np.eye(4)
-    pose[:3] = placed.rotation.T @ np.asarray(camera.cam_to_world, np.float64)
-    pose[:3, 3] += placed.origin
-    return pose

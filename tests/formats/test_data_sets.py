@@ -63,7 +63,7 @@ def test_a_damaged_or_missing_file_is_named_with_the_remedy(file, copy):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda t: t.pop("fl_x"), "no entry 'fl_x'"),
+        (lambda t: t.pop("h"), "no entry 'h'"),
         (lambda t: t["frames"].clear(), "cannot be read"),
         (lambda t: t["frames"][0]["transform_matrix"][1].__setitem__(2, float("nan")), "NaN"),
         (lambda t: t.update(w=12), "24 x 24 pixels, transforms.json says 12 x 24"),

@@ -1,11 +1,41 @@
 """Padding, buckets and the box of clouds as arrays."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.point_clouds import sphere_points
+from support.point_clouds import sphere_points, write_rows
 
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.kernels.cloud_arrays import bucket, normalization, pad
+from spnr_jax.kernels.cloud_arrays import bucket, make_cloud, normalization, pad
+
+
+@pytest.mark.parametrize("known", [(), ("roughness",), ("roughness", "metallic"), ("base_color", "normals")])
+def test_a_cloud_of_arrays_is_the_cloud_of_a_file_that_holds_them(tmp_path, known):
+    positions = sphere_points(3, 30)
+    given = {"base_color": np.abs(positions), "normals": positions, "roughness": positions[:, 0] ** 2}
+    given = {name: values for name, values in (given | {"metallic": positions[:, 1] ** 2}).items() if name in known}
+    columns = {name: values for name, values in given.items() if values.ndim == 1}
+    for name, axes in (
+        ("base_color", ("base_color_r", "base_color_g", "base_color_b")),
+        ("normals", ("nx", "ny", "nz")),
+    ):
+        columns |= dict(zip(axes, given[name].T, strict=True)) if name in given else {}
+    read, made = read_cloud(write_rows(tmp_path, positions, **columns)), make_cloud(positions, **given)
+    traced = jax.jit(make_cloud)(jnp.asarray(positions), **given)
+    for name, values in vars(read).items():
+        assert (getattr(made, name) is None) == (getattr(traced, name) is None) == (values is None), name
+        if values is not None:
+            np.testing.assert_allclose(getattr(made, name), values, atol=1e-6, err_msg=name)
+            np.testing.assert_array_equal(getattr(traced, name), getattr(made, name))
+            assert getattr(made, name).dtype == getattr(traced, name).dtype == values.dtype
+
+
+def test_one_value_holds_for_all_points():
+    positions = sphere_points(3, 3)
+    made = make_cloud(positions, (0.1, 0.2, 0.3), roughness=0.7)
+    np.testing.assert_array_equal(made.base_color, np.float32([[0.1, 0.2, 0.3]] * 3))
+    np.testing.assert_array_equal([made.roughness, made.metallic], np.float32([[0.7] * 3, [0] * 3]))
 
 
 def test_padding_adds_masked_zeros_and_changes_no_real_point(tmp_path):

@@ -10,7 +10,7 @@ from spnr_jax.kernels.cloud_arrays import (
     candidates,
     farthest_points,
     first_in_voxels,
-    plain_cloud,
+    make_cloud,
     sample_stream,
     stack_columns,
 )
@@ -37,7 +37,7 @@ def test_with_normals_each_side_of_a_thin_wall_is_covered_by_itself_and_still_ev
 
     def gap_and_evenness(kept):
         gaps = [cKDTree(wall[kept[front[kept] == side]]).query(wall[front == side])[0].max() for side in (True, False)]
-        one = plain_cloud(np.float32(wall[kept]), normals=np.float32(normals[kept]))
+        one = make_cloud(wall[kept], normals=normals[kept])
         return max(gaps), float(measure_evenness(one, neighbors(one)))
 
     blind, told = (gap_and_evenness(farthest_points(wall, 400, 0, of)) for of in (None, normals))

@@ -7,6 +7,9 @@ import sys
 import spnr_jax
 
 CALLS = {
+    "make_cloud(np.zeros((3, 9)))": "make_cloud: positions has the shape (3, 9), expected (points, 3)",
+    "make_cloud(rows[0], rows[1, :8])": "make_cloud: base_color has the shape (8, 3), expected (9, 3)",
+    "make_cloud(rows[0], metallic=rows[1])": "make_cloud: metallic has the shape (9, 3), expected (9,)",
     "neighbors(cloud.replace(positions=np.zeros((9, 2))))": "neighbors: cloud.positions has the shape (9, 2), expected",
     "neighbors(cloud.replace(positions=np.full((9, 3), np.nan)))": "neighbors: cloud.positions has NaN or infinity",
     "neighbors(cloud.replace(mask=np.ones(9)))": "neighbors: cloud.mask is of type float64, expected bool",
@@ -38,11 +41,10 @@ SCRIPT = """
 import json, sys
 import jax, numpy as np
 import spnr_jax
-from spnr_jax import PointCloud, densify, encode, neighbors, plan, render
+from spnr_jax import densify, encode, make_cloud, neighbors, plan, render
 
 rows = np.random.default_rng(0).random((4, 9, 3)).astype(np.float32)
-cloud = PointCloud(positions=rows[0], base_color=rows[1], roughness=rows[2, :, 0], metallic=rows[3, :, 0],
-                   mask=np.ones(9, bool))
+cloud = make_cloud(*rows[:2], *rows[2:, :, 0])
 near, light, model = neighbors(cloud), spnr_jax.sun(40, 30), spnr_jax.load()
 scene = jax.jit(encode)(None, cloud, near)
 camera = model.camera(scene, resolution=16)

@@ -1,5 +1,6 @@
 """Every picture that was asked for lies where it was said, and a cloud in any file comes out as pictures."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -69,6 +70,22 @@ def test_a_file_turned_and_moved_gives_the_same_pictures_and_cameras_that_moved_
         inside = to_box["scale"] * (positions @ np.array(to_box["rotation"]).T - to_box["centre"])
         np.testing.assert_allclose(inside.min(axis=0), -inside.max(axis=0), atol=1e-5)
         np.testing.assert_allclose(np.linalg.norm(inside.max(axis=0)), 1, atol=1e-5)
+
+
+def test_the_cameras_that_were_written_draw_the_same_stills_again(tmp_path):
+    cloud = cloud_file(tmp_path)
+    rendered(cloud, tmp_path / "a", up="z", turntable="none", elevation=40.0)
+    written = tmp_path / "a" / "chair_cameras.json"
+    again = Render(cloud=cloud, out=tmp_path / "b", run=tiny_untrained.run(), cameras=written, num_points=30, up="z")
+    list(pictures.render_file(dataclasses.replace(again, frames=2), lambda line: None))
+    assert names(tmp_path / "b") == STILLS | {"chair_turntable.gif"}
+    for name in sorted(STILLS):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    with pytest.raises(ValueError, match="--views: not together with --cameras"):
+        dataclasses.replace(again, views=2)
+    written.write_text("{}")
+    with pytest.raises(ValueError, match=r"chair_cameras\.json: no frames"):
+        list(pictures.render_file(dataclasses.replace(again, cloud=tmp_path / "none.ply"), lambda line: None))
 
 
 def test_straight_alpha_laid_on_white_is_the_image_again():

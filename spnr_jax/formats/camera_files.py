@@ -1,0 +1,106 @@
+"""Cameras of files in the convention of NeRF and nerfstudio (transforms.json).
+
+`frames` hold a `transform_matrix` each: camera to world, OpenGL axes (x right, y up, looking along -z).  Intrinsics are
+those of the frame or of the whole file: `w` and `h` in pixels, `fl_x` or `camera_angle_x`, and optionally `fl_y`, `cx`
+and `cy`.  Cameras are pinholes: lens distortion is not drawn.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spnr_jax.errors import UserError
+from spnr_jax.kernels.records import Camera
+
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
+WRONG = 1e-2  # largest difference of rotation @ rotation.T from the identity
+MOST_PIXELS = 2**14  # along a side
+EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
+
+
+def read_cameras(
+    path: str | Path,
+    *,
+    rotation: np.ndarray | None = None,
+    origin: np.ndarray | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> list[Camera]:
+    """The cameras of a file, in its frame or, if given, in that of rotation @ (position - origin).
+
+    `report` gets a line if lens distortion is left out.  ValueError, one line that names the file, if it has none.
+    """
+    try:
+        document = json.loads(Path(path).read_bytes())
+        cameras = cameras_of(document, rotation, origin)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from None
+    except UserError as error:
+        raise UserError(f"{path}: {error}; {EXPECTED}") from None
+    except KeyError as error:
+        raise UserError(f"{path}: no entry {error}; {EXPECTED}") from None
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        raise UserError(f"{path}: no valid JSON, or something else where a number should be; {EXPECTED}") from None
+    if any(frame.get(name) for frame in (document, *document["frames"]) for name in DISTORTION):
+        report("lens distortion is left out: pinhole cameras are drawn")
+    return cameras
+
+
+def cameras_of(
+    document: Mapping[str, Any], rotation: np.ndarray | None = None, origin: np.ndarray | None = None
+) -> list[Camera]:
+    """The cameras of a file's content, float32; KeyError for a missing entry, Type- or ValueError for a wrong one."""
+    turn, place = np.eye(3) if rotation is None else rotation, np.zeros(3) if origin is None else origin
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise UserError("no frames")
+    return [_camera({**document, **frame}, number, turn, place) for number, frame in enumerate(frames)]
+
+
+def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origin: np.ndarray) -> Camera:
+    """One camera; in double precision until the origin is subtracted."""
+    if entries.get("camera_model") in FISHEYE:
+        raise UserError(f"camera_model {entries['camera_model']}, where pinhole cameras are drawn")
+    width, height = (int(entries[name]) for name in "wh")
+    if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
+        raise UserError(f"{width} x {height} pixels in frame {number}, where 1 to {MOST_PIXELS} are drawn")
+    if "fl_x" not in entries and "camera_angle_x" in entries:
+        across = 0.5 * width / np.tan(0.5 * float(entries["camera_angle_x"]))
+    else:
+        across = float(entries["fl_x"])
+    down, cx, cy = (float(entries.get(*x)) for x in (("fl_y", across), ("cx", width / 2), ("cy", height / 2)))
+    intrinsics = np.array([[across, 0, cx], [0, down, cy], [0, 0, 1]])
+    matrix = np.asarray(entries["transform_matrix"], np.float64)
+    if matrix.shape not in ((4, 4), (3, 4)) or not (np.isfinite(matrix).all() and np.isfinite(intrinsics).all()):
+        raise UserError(f"a camera holds NaN or infinity, or is no 4 x 4 matrix (frame {number})")
+    if not min(across, down) > 0:
+        raise UserError(f"focal lengths {across:g} and {down:g} in frame {number}, expected positive ones")
+    turn = matrix[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > WRONG or np.linalg.det(turn) < 0:
+        raise UserError(f"the transform_matrix of frame {number} is no rotation and place")
+    pose = np.concatenate([rotation @ turn, (rotation @ (matrix[:3, 3] - origin))[:, None]], axis=1)
+    return Camera(
+        cam_to_world=pose.astype(np.float32), intrinsics=intrinsics.astype(np.float32), height=height, width=width
+    )
+
+
+def describe_cameras(cameras: Sequence[Camera], names: Sequence[str], rotation: np.ndarray, origin: np.ndarray) -> dict:
+    """The content of a file that `read_cameras` reads, with this rotation and origin, as these cameras."""
+    intrinsics = [_intrinsics(camera) for camera in cameras]
+    common = {name: x for name, x in intrinsics[0].items() if all(other[name] == x for other in intrinsics)}
+    frames = []
+    for name, camera, numbers in zip(names, cameras, intrinsics, strict=True):
+        pose = np.eye(4)
+        pose[:3] = rotation.T @ np.asarray(camera.cam_to_world, np.float64)
+        pose[:3, 3] += origin
+        own = {key: x for key, x in numbers.items() if key not in common}
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()} | own)
+    return {"camera_model": "OPENCV", **common, "frames": frames}
+
+
+def _intrinsics(camera: Camera) -> dict[str, int | float]:
+    (fl_x, _, cx), (_, fl_y, cy), _ = np.asarray(camera.intrinsics, np.float64).tolist()
+    return {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
