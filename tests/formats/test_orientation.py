@@ -6,6 +6,7 @@ from support.point_clouds import ply_bytes
 
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.orientation import ROTATIONS, find_up, sensor_of, standing
+from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral
 
 AXES = ["view_px", "view_py", "view_pz", "y_axisx", "y_axisy", "y_axisz"]
@@ -93,17 +94,32 @@ def cone() -> np.ndarray:
     return np.stack([radius * np.cos(angle), 2 * height, radius * np.sin(angle)], axis=-1)
 
 
+def aeroplane() -> np.ndarray:
+    """Points of an aeroplane, y up: it stands on one wheel, and its broadest end is the tail."""
+    rng = np.random.default_rng(2)
+    boxes = np.array([[0.1, 0.1, 1], [1, 0.02, 0.15], [0.5, 0.02, 0.1], [0.02, 0.3, 0.1], [0.05, 0.05, 0.05]])
+    middles = np.array([[0, 0, 0], [0, -0.05, 0.1], [0, 0.08, -1], [0, 0.3, -1], [0, -0.3, 0.5]])
+    part = rng.choice(5, 1500, p=[0.4, 0.35, 0.15, 0.05, 0.05])  # body, wings, tail, fin, wheel
+    on_box, thin = rng.uniform(-1, 1, (1500, 3)), np.array([0, 1, 1, 0, 1])[part]
+    axis = np.where(part == 0, rng.integers(2, size=1500), thin)
+    on_box[np.arange(1500), axis] = np.sign(on_box[np.arange(1500), axis])
+    return middles[part] + boxes[part] * on_box
+
+
 @pytest.mark.parametrize("up", "yz")
 def test_what_stands_is_found_upright_unless_its_format_defines_its_axes(up):
-    for positions in (table(), cone()):
+    for positions in (table(), cone(), aeroplane()):
         turned = positions @ np.array(ROTATIONS[up])
         assert find_up(turned, ".ply")[0] == up
         assert [find_up(turned, kind)[0] for kind in (".glb", ".gltf", ".las", ".laz")] == ["y", "y", "z", "z"]
 
 
 def test_the_size_and_place_of_the_object_do_not_matter():
+    points = table()
+    normals = estimate_normals(points, points)
     for axis in range(3):
-        np.testing.assert_allclose(standing(table() * 1e5 + [3e5, 0, 7e5], axis), standing(table(), axis), atol=1e-6)
+        moved = standing(points * 1e5 + [3e5, 0, 7e5], normals, axis)
+        np.testing.assert_allclose(moved, standing(points, normals, axis), atol=1e-6)
 
 
 def test_points_on_a_line_or_alone_are_y_up():
