@@ -3,8 +3,8 @@
 glTF is y up and laser scans (.las) are z up by definition.  Of other files y or z is chosen, whichever has the larger
 (base + level) / 2 + unlike - crowd:
 
-base     it stands on a broad base: the larger convex hull of the points within BASE of either end of the axis, over that
-         of all points seen along the axis
+base     it stands on a broad base: the larger convex hull of the points within BASE of either end of the axis, over
+         that of all points seen along the axis
 level    it has level surfaces: the share of the points whose normal is nearly that of the axis
 unlike   it ends differently above: how far the points, upside down, lie from the points, over UNLIKE, at most 1
 crowd    it does not end in a panel: the larger share of the points within BASE of either end
