@@ -15,7 +15,9 @@ from data_gen.make.generate import generate
 from data_gen.plan.tasks import PRESETS, GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.show import ShowConfig, show
-from spnr_jax.errors import UserError, guard, split_debug
+from spnr_jax.devices.arguments import parse as parse_options
+from spnr_jax.devices.arguments import split_debug, take_option
+from spnr_jax.errors import UserError, guard
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,22 +44,21 @@ def parse(arguments: list[str]) -> Command:
     generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
     check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
     show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
-    return tyro.cli(
-        generate_options | check_options | show_options,  # type: ignore[arg-type]
-        prog="spnr-data",
-        description="Data sets of rendered objects and their surface points. "
-        "With --debug or SPNR_DEBUG=1 an error shows its call stack.",
-        args=arguments,
+    description = (
+        "Data sets of rendered objects and their surface points. With --debug or SPNR_DEBUG=1 an error shows its"
+    )
+    return parse_options(
+        generate_options | check_options | show_options,
+        "spnr-data",
+        arguments,
+        f"{description} call stack.",
+        ("generate", "check", "show"),
     )
 
 
 def preset_defaults(arguments: list[str]) -> GenerateConfig:
-    """What --preset among the arguments stands for; tyro refuses a name that there is not."""
-    preset = None
-    for name, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        option, _, value = name.partition("=")
-        if option == "--preset":
-            preset = PRESETS.get(value or following)
+    """What --preset among the arguments stands for; a name that there is not is refused with the other options."""
+    preset = PRESETS.get(take_option(arguments, "--preset")[0] or "")
     return preset(tyro.MISSING) if preset else GenerateConfig(out=tyro.MISSING)
 
 

@@ -5,19 +5,18 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-import tyro
-
 import experiments.baselines  # noqa: F401 - registers them: runs of theirs are loaded by every command
 from spnr_jax import errors
+from spnr_jax.devices import arguments
 
 
 def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
     """Calls `main` with the options of the command line `python -m experiments.NAME`, and ends the process."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in spnr_jax/devices/runtime.py
 
-    arguments, debug = errors.split_debug(sys.argv[1:])
+    given, debug = arguments.split_debug(sys.argv[1:])
 
     def work() -> None:
-        main(tyro.cli(options, prog=f"python -m experiments.{name}", args=arguments))
+        main(arguments.parse(options, f"python -m experiments.{name}", given))
 
     sys.exit(errors.guard(work, name.rpartition(".")[2], debug))

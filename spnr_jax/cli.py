@@ -3,12 +3,9 @@
 Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-C keeps the state and exits with 130.
 """
 
-import contextlib
 import dataclasses
 import importlib.util
-import io
 import os
-import re
 import sys
 import time
 from collections.abc import Callable
@@ -19,11 +16,11 @@ import tyro
 
 from spnr_jax import methods, presets
 from spnr_jax.devices import runtime
-from spnr_jax.errors import STOPPED, UserError, guard, one_line, require, split_debug, stop_at_once
+from spnr_jax.devices.arguments import parse as parse_options
+from spnr_jax.devices.arguments import split_debug, take_option
+from spnr_jax.errors import STOPPED, UserError, guard, one_line, require, stop_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View
 
-# what tyro draws around an error, its marks of bold letters, and its name for the whole command
-BOX = r"[╭╮╰╯│─•]+|\[/?bold\]|__tyro-dummy-inner__\."
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
 --debug, or SPNR_DEBUG=1, shows the call stack of an error.
 --methods FILE, a .py file or a module, adds methods and presets of your own to every command (docs/own_network.md)."""
@@ -49,45 +46,20 @@ def parse(arguments: list[str]) -> Command:
 
     Two are read before the others: --methods, which adds methods and presets, and --preset, which gives the defaults.
     """
-    source, arguments = _take_option(arguments, "--methods")
+    source, arguments = take_option(arguments, "--methods")
     if source is not None:
         methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
-    stderr = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(stderr):
-            return tyro.cli(
-                train | Evaluate | Render | View | Export | Share,
-                prog="spnr",
-                description=DESCRIPTION,
-                args=arguments,
-            )
-    except SystemExit as stop:
-        if stop.code:
-            said = re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])  # without the title
-            commands = {record.__name__.lower() for record in get_args(Command)}
-            command = next((f"{name} " for name in arguments[:1] if name in commands), "")
-            raise UserError(said.replace("spnr --help", f"spnr {command}--help")) from None
-        raise
+    names = [record.__name__.lower() for record in get_args(Command)]
+    return parse_options(train | Evaluate | Render | View | Export | Share, "spnr", arguments, DESCRIPTION, names)
 
 
 def _train_defaults(arguments: list[str]) -> Train:
     """Defaults of the preset; its network determines the options."""
-    preset, _ = _take_option(arguments, "--preset")
-    preset = "tiny" if preset is None else preset
+    preset = take_option(arguments, "--preset")[0] or "tiny"
     if preset not in presets.PRESETS:
         raise UserError(f"--preset {preset}: there are {', '.join(presets.PRESETS)}")
     return Train(data=tyro.MISSING, run=tyro.MISSING, config=presets.PRESETS[preset]())
-
-
-def _take_option(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
-    """The value of an option (None if not given), and the other arguments."""
-    for i, argument in enumerate(arguments):
-        if argument == name:
-            return "".join(arguments[i + 1 : i + 2]), arguments[:i] + arguments[i + 2 :]
-        if argument.startswith(f"{name}="):
-            return argument.removeprefix(f"{name}="), arguments[:i] + arguments[i + 1 :]
-    return None, arguments
 
 
 def run(command: Command) -> None:

@@ -1,4 +1,4 @@
-"""Errors that a user can fix, bugs of this project, stops by Ctrl-C, and when a call stack is shown."""
+"""Errors that a user can fix, bugs of this project, and stops by Ctrl-C."""
 
 import _thread
 import contextlib
@@ -42,12 +42,6 @@ def require_within(options: Any, low: float | int, high: float | int, *names: st
 def require_at_least(options: Any, least: float | int, *names: str) -> None:
     """UserError for the first of these options that is given and smaller."""
     require_within(options, least, math.inf, *names)
-
-
-def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
-    """The arguments without `--debug`, and whether call stacks are shown: for it, or for SPNR_DEBUG=1."""
-    others = [argument for argument in arguments if argument != "--debug"]
-    return others, len(others) < len(arguments) or os.environ.get("SPNR_DEBUG", "0") not in ("", "0")
 
 
 def is_bug(error: Exception) -> bool:

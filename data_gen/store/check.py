@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def read_splits(dataset: Path) -> tuple[dict[str, list[str]], list[str]]:
             splits[split] = (dataset / "splits" / f"{split}.txt").read_text().split()
         except OSError as error:
             missing = f"{error.filename}: {error.strerror}"
-            faults = [f"{missing}; the run has not finished: repeat the command that began it"]
+            faults += [f"{missing}; the run has not finished: repeat the command that began it"]
     return splits, faults
 
 
@@ -90,7 +91,7 @@ def split_faults(splits: Mapping[str, list[str]], object_ids: set[str]) -> list[
     """What is wrong with the splits: each object has to be in exactly one."""
     listed = [object_id for ids in splits.values() for object_id in ids]
     faults = []
-    if twice := sorted({object_id for object_id in listed if listed.count(object_id) > 1}):
+    if twice := sorted(object_id for object_id, times in Counter(listed).items() if times > 1):
         faults.append(f"splits: {twice[0]} is listed more than once ({len(twice)} such objects)")
     if absent := sorted(set(listed) - object_ids):
         faults.append(f"splits: {absent[0]} is listed but has no folder ({len(absent)} such objects)")

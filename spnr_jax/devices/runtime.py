@@ -161,7 +161,8 @@ def describe_hardware() -> str:
         return f"{jax.device_count()} x {device.device_kind}"
     lines = CPUINFO.read_text().splitlines() if CPUINFO.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{len(os.sched_getaffinity(0))} cores of {(names or [platform.machine()])[0]}"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{cores} cores of {(names or [platform.machine()])[0]}"
 
 
 def measure_load() -> float:

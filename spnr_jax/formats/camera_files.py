@@ -80,7 +80,7 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
         raise UserError(f"focal lengths {across:g} and {down:g} in frame {number}, expected positive ones")
     turn = matrix[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > WRONG or np.linalg.det(turn) < 0:
-        raise UserError(f"the transform_matrix of frame {number} is no rotation and place")
+        raise UserError(f"the rotation of frame {number} is not orthonormal")
     pose = np.concatenate([rotation @ turn, (rotation @ (matrix[:3, 3] - origin))[:, None]], axis=1)
     return Camera(
         cam_to_world=pose.astype(np.float32), intrinsics=intrinsics.astype(np.float32), height=height, width=width

@@ -260,9 +260,13 @@ class Export:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
-        given = [name for name in changed_options(self) if name in ("--network", "--up", "--clean")]
-        given += [*changed_options(self.lighting), *changed_options(self.making)]
-        require(self.splats is not None or not given, f"{''.join(given[:1])} is for --splats FILE, which is not given")
+        changed = changed_options(self)
+        of_cloud = [name for name in changed if name in ("--network", "--up", "--clean")]
+        of_cloud += [*changed_options(self.lighting), *changed_options(self.making)]
+        of_network = [name for name in changed if name in ("--out", "--resolution", "--quality", "--platforms")]
+        if wrong := of_cloud[:1] if self.splats is None else of_network[:1]:
+            what = "is for --splats FILE, which is not given" if self.splats is None else "is not for --splats"
+            raise UserError(f"{wrong[0]} {what}; leave it out")
         at_white = self.lighting.background == "white"
         require(at_white, "--background light: splats have no background; leave it out")
 

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import math
+import re
 import shutil
 import sys
 import typing
@@ -237,6 +238,16 @@ def test_a_command_explains_its_options(name, monkeypatch, capsys):
         entry_point.run(main, options, name)
     assert ended.value.code == 0
     assert "--out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["--no-such-option", "3"], ["--out"], []])
+def test_a_wrong_option_of_a_command_is_one_line_and_code_2(arguments, monkeypatch, capsys):
+    main, options = main_of(name := "studies.sharpness")
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        entry_point.run(main, options, name)
+    assert ended.value.code == 2
+    assert re.fullmatch(rf"sharpness: .*python -m experiments\.{name} --help\s*\n", capsys.readouterr().err)
 
 
 @pytest.mark.ci

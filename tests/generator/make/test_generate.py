@@ -137,6 +137,8 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
         (["--objects", "8", "--test-objects", "8"], "--test-objects 8: leaves none of the 8"),
         (["--colour-variants", "-1"], "--colour-variants: expected 0 or more"),
         (["--train-objects", "0"], "--train-objects: expected 1 or more"),
+        (["--no-such-option", "3"], "--no-such-option"),
+        (["--preset"], "--preset needs a value"),
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_2(arguments, expected, tmp_path, monkeypatch, capsys):

@@ -1,0 +1,49 @@
+"""Command lines: options that are read before the others, and options as records, an error in one line."""
+
+import contextlib
+import io
+import os
+import re
+from collections.abc import Collection
+from typing import Any
+
+import tyro
+
+from spnr_jax.errors import UserError
+
+# what tyro draws around an error, its marks of bold letters, and its name for the whole command
+BOX = r"[╭╮╰╯│─•]+|\[/?bold\]|__tyro-dummy-inner__\."
+
+
+def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
+    """The arguments without `--debug`, and whether call stacks are shown: for it, or for SPNR_DEBUG=1."""
+    others = [argument for argument in arguments if argument != "--debug"]
+    return others, len(others) < len(arguments) or os.environ.get("SPNR_DEBUG", "0") not in ("", "0")
+
+
+def take_option(arguments: list[str], name: str) -> tuple[str | None, list[str]]:
+    """The value of an option (None if not given), and the other arguments; ValueError for an option without one."""
+    for i, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if option == name:
+            value, used = (value, 1) if equals else ("".join(arguments[i + 1 : i + 2]), 2)
+            if not value:
+                raise UserError(f"{name} needs a value")
+            return value, arguments[:i] + arguments[i + used :]
+    return None, arguments
+
+
+def parse(
+    options: Any, prog: str, arguments: list[str], description: str | None = None, commands: Collection[str] = ()
+) -> Any:
+    """The options of a record, or of one of several commands of these names; UserError for what they do not allow."""
+    stderr = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(stderr):
+            return tyro.cli(options, prog=prog, description=description, args=arguments)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        said = re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])  # without the title
+        command = next((f" {name}" for name in arguments[:1] if name in commands), "")
+        raise UserError(said.replace(f"{prog} --help", f"{prog}{command} --help")) from None
