@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from data_gen.store.check import object_faults
+from data_gen.store.check import object_faults, read_splits, split_faults
 
 ITEM = tiny_dataset.one_object()
 SETTINGS = {"views": tiny_dataset.VIEWS, "resolution": tiny_dataset.SIZE, "points": tiny_dataset.POINTS}
@@ -40,3 +40,15 @@ def test_what_is_wrong_with_an_object_is_named(item, details, expected):
     faults = object_faults(replace(tiny_dataset.dataset(), settings={"settings": SETTINGS}), item, details)
     assert bool(faults) == (expected is not None), faults
     assert expected is None or re.search(expected, faults[0])
+
+
+def test_every_missing_list_and_every_object_that_is_listed_twice_or_nowhere_is_named(tmp_path):
+    splits, faults = read_splits(tmp_path)
+    assert [fault.partition(".txt")[0].rpartition("/")[2] for fault in faults] == ["train", "val", "test"]
+    assert splits == {}
+    found = split_faults({"train": ["a", "b", "a"], "test": ["c"]}, {"a", "b", "d"})
+    assert [fault.partition(" (")[0] for fault in found] == [
+        "splits: a is listed more than once",
+        "splits: c is listed but has no folder",
+        "splits: d is in no split",
+    ]
