@@ -23,6 +23,7 @@ from data_gen.render.variant import mitsuba_module
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Asset, Material, Part
 from spnr_jax.formats.data_sets import on_white
+from spnr_jax.kernels.imaging import linear_to_srgb
 
 POLE_COSINE = 0.999  # nearer to the y axis than this, z takes the part of "up"
 
@@ -229,12 +230,7 @@ def straight_srgb(radiance: np.ndarray) -> np.ndarray:
     """(height, width, 4) uint8 sRGB with straight alpha from premultiplied linear radiance with alpha."""
     alpha = np.clip(radiance[..., 3:], 0, 1)
     color = np.where(alpha > 0, radiance[..., :3] / np.where(alpha > 0, alpha, 1), 0)
-    return np.round(255 * np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), alpha], axis=-1)).astype(np.uint8)
-
-
-def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """The sRGB encoding (IEC 61966-2-1) of linear values in [0, 1]."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.round(255 * np.concatenate([linear_to_srgb(np.clip(color, 0, 1)), alpha], axis=-1)).astype(np.uint8)
 
 
 def condition_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

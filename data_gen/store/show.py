@@ -15,6 +15,7 @@ from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, on_white
 from spnr_jax.formats.images import png_url, template, write_whole
+from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import PointCloud
 
 CHANNELS = ("base_color", "roughness", "metallic")  # that are shown of points
@@ -79,8 +80,8 @@ def point_image(cloud: PointCloud, channel: str) -> np.ndarray:
     camera = views.ViewConfig(resolution=POINT_IMAGE)
     pose = views.look_at(camera.distance * np.array([0.5, 0.4, 0.77]))
     positions, values = np.asarray(cloud.positions, np.float64), np.asarray(getattr(cloud, channel))
-    values = views.srgb_from_linear(values) if values.ndim == 2 else np.repeat(values[:, None], 3, axis=1)
-    colors = np.round(255 * values).astype(np.uint8)
+    shown = linear_to_srgb(values) if values.ndim == 2 else np.repeat(values[:, None], 3, axis=1)
+    colors = np.asarray(np.round(255 * shown), np.uint8)
     far_first = np.argsort((positions - pose[:3, 3]) @ pose[:3, 2])
     columns, rows = np.floor(views.project(pose, positions, camera)).astype(int).clip(0, POINT_IMAGE - 2)[far_first].T
     canvas = np.tile(BACKDROP, (POINT_IMAGE, POINT_IMAGE, 1))

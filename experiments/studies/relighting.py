@@ -124,14 +124,9 @@ def log_errors(item: ObjectData, pictures: Pictures) -> list[float]:
     found = []
     for image, rgba in zip(pictures.image, item.images, strict=True):
         inside = rgba[..., 3] == 255
-        ours, theirs = (np.log(np.maximum(linear(x), DARK)) for x in (image, data_sets.on_white(rgba)))
+        ours, theirs = (np.log(np.maximum(srgb_to_linear(x), DARK)) for x in (image, data_sets.on_white(rgba)))
         found.append(float(np.sqrt(np.mean((ours - theirs)[inside] ** 2))) if inside.any() else 0.0)
     return found
-
-
-def linear(image: np.ndarray) -> np.ndarray:
-    """Linear light of an sRGB picture."""
-    return np.asarray(srgb_to_linear(jnp.asarray(image)))
 
 
 def _write(out: Path, found: Found) -> None:

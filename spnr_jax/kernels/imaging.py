@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.records import Rendering
+from spnr_jax.kernels.numerics import array_namespace
+from spnr_jax.kernels.records import AnyArray, Rendering
 
 WHITE = 1.0  # background of every picture
 
@@ -22,18 +23,18 @@ LINEAR_LIMIT, ENCODED_LIMIT = 0.0031308, 0.04045  # where line and power meet
 SLOPE, SCALE, OFFSET, EXPONENT = 12.92, 1.055, 0.055, 2.4
 
 
-def linear_to_srgb(linear: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """sRGB values of linear ones: [0, 1] onto [0, 1]; nothing is clipped."""
-    power = linear > LINEAR_LIMIT
-    encoded = SCALE * jnp.where(power, linear, 1.0) ** (1 / EXPONENT) - OFFSET
-    return jnp.where(power, encoded, SLOPE * linear)
+def linear_to_srgb(linear: Float[AnyArray, "*batch"]) -> Float[AnyArray, "*batch"]:
+    """sRGB values of linear ones (IEC 61966-2-1): [0, 1] onto [0, 1]; nothing is clipped."""
+    xp, power = array_namespace(linear), linear > LINEAR_LIMIT
+    encoded = SCALE * xp.where(power, linear, 1) ** (1 / EXPONENT) - OFFSET
+    return xp.where(power, encoded, SLOPE * linear)
 
 
-def srgb_to_linear(encoded: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Linear values of sRGB ones: [0, 1] onto [0, 1]; nothing is clipped."""
-    power = encoded > ENCODED_LIMIT
-    linear = ((jnp.where(power, encoded, 1.0) + OFFSET) / SCALE) ** EXPONENT
-    return jnp.where(power, linear, encoded / SLOPE)
+def srgb_to_linear(encoded: Float[AnyArray, "*batch"]) -> Float[AnyArray, "*batch"]:
+    """Linear values of sRGB ones (IEC 61966-2-1): [0, 1] onto [0, 1]; nothing is clipped."""
+    xp, power = array_namespace(encoded), encoded > ENCODED_LIMIT
+    linear = ((xp.where(power, encoded, 1) + OFFSET) / SCALE) ** EXPONENT
+    return xp.where(power, linear, encoded / SLOPE)
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------

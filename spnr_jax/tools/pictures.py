@@ -74,7 +74,7 @@ def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Lig
 def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
     """The environment map as seen by a camera, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
-    return linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1))
+    return jnp.asarray(linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1)))
 
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
