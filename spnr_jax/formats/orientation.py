@@ -3,12 +3,11 @@
 glTF is y up and laser scans (.las) are z up by definition.  Of other files y or z is chosen: an object stands on a
 broad base and ends differently above, so an axis counts by how much the bases at its two ends differ, and by the larger
 of them.  The base at an end is the convex hull of the points within BASE of it, as a share of the hull of all points
-seen along the axis.  Of 78 real objects 69 are found upright as they are (y up) and 61 turned to z up; where it fails,
-say which axis (`--up`).
+seen along the axis.  Of 78 real objects 69 are found upright as they are (y up) and 61 turned to z up.
 
-PCD headers and PLY camera elements name the place of a sensor.  Every point was seen from there, so that its normal
-points to it; and a camera's own axes say which way is up.  The place 0 0 0 that writers of PCD put there for want of a
-better one is believed if nothing hides the points from it, another place if it sees most of them.
+PCD headers and PLY camera elements name the place of a sensor, to which normals point; a camera's axes say which way is
+up.  The place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from
+it, another place if it sees most of them.
 """
 
 from collections.abc import Callable
