@@ -105,7 +105,7 @@ def _visible(parts: list[Part], loading: Loading) -> list[Part]:
     for number, part in enumerate(parts):
         hidden = invisible({"x": part.positions[:, 0]} | ({} if part.alpha is None else {"alpha": part.alpha}))
         broken = ~np.isfinite(part.positions[part.faces]).all(axis=(1, 2))
-        masks = broken, hidden[part.faces].all(axis=1) & ~broken
+        masks = broken, hidden[part.faces].all(axis=1) & ~broken & ~hidden.all()
         lost = {reason: count + int(mask.sum()) for (reason, count), mask in zip(lost.items(), masks, strict=True)}
         parts[number] = replace(part, faces=part.faces[~np.any(masks, axis=0)])
     for reason, count in lost.items():

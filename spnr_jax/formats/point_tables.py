@@ -41,8 +41,9 @@ COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of colu
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of Windows, of databases
-UNITS = re.compile(r"[(\[][^)\]]*[)\]]")
-UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
+UNITS = re.compile(
+    r"[(\[](?![\d.]+[)\]])[^)\]]*[)\]]"
+)  # a number is CloudCompare's radius: its roughness is no material
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
@@ -82,6 +83,8 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             found += len(rows)
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             names = names or _names(before, table, path.suffix.lower(), report)
+            if any(plain_name(names[i]) in ARRAYS for i in unread):
+                raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -99,7 +102,7 @@ def encoding_of(head: bytes) -> str:
     """The encoding of text that begins so."""
     if 0 in head[:2]:
         return "utf-16-le" if head[0] else "utf-16-be"
-    return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
+    return "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
 def _unquote(text: str) -> str:
@@ -299,10 +302,7 @@ def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> b
 def read_arrays(
     file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
 ) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive, those that are wanted; ValueError if it is broken or unpacks to too much.
-
-    `report` gets a line about the others.
-    """
+    """The wanted arrays of an .npz archive, a line about others; ValueError if broken, or if it unpacks to too much."""
     with refusing("is a broken or truncated NumPy file"), PARSER, np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}

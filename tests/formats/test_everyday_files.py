@@ -28,13 +28,11 @@ UTM = np.array([500_000.123, 5_200_000.377, 120.0])
 
 
 def test_points_of_a_scene_lie_where_their_nodes_put_them_and_splats_are_refused(tmp_path):
-    builder, extension = GltfBuilder(), "KHR_gaussian_splatting"
-    points = builder.primitive(BALL.astype("f4"), None, mode=0)
+    builder, extension, ball = GltfBuilder(), "KHR_gaussian_splatting", BALL.astype("f4")
+    points = builder.primitive(ball, None, mode=0)
     builder.mesh(points, scale=[2, 2, 2])
     np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, 2 * BALL, atol=1e-6)
-    turned = builder.primitive(
-        BALL.astype("f4"), np.arange(3, dtype="u2"), mode=0, NORMAL=BALL.astype("f4"), material=0
-    )
+    turned = builder.primitive(ball, np.arange(3, dtype="u2"), mode=0, NORMAL=ball, material=0)
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}}]
     builder.mesh(turned, rotation=[0, 0, 0.5**0.5, 0.5**0.5])
     (cloud, _), turn = read(builder.write(tmp_path / "a.glb")), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
@@ -424,6 +422,7 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
     cloud, lines = read(write(tmp_path, "a.off", hidden), num_points=100)
     assert (cloud.positions[:, 1] >= cloud.positions[:, 0]).all()
     assert "1 face left out for the alpha of their vertices, near 0" in lines
+    assert not any("alpha" in line for line in read(write(tmp_path, "a.off", hidden.replace(" 1\n", " 0\n")))[1])
 
 
 @pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", r"Maps\COLORS.png"])

@@ -90,7 +90,7 @@ WORDY = "name,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
 PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ascii\n"
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
-BALL_AND_TWO = [(*point, 0, 0) for point in POINTS]
+GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
@@ -185,7 +185,7 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
         ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
         ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
-        ("a.csv", "x,y,z,depth,label\n" + table(",", columns=BALL_AND_TWO), "columns that are not used: depth, label"),
+        ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
     ],
 )
@@ -449,6 +449,7 @@ REFUSED = [
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
+    ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", "line 2: expected 3 numbers, found '1,2m,3'"),
     ("a.csv", "x,y,z\n0,5,1,5,2,5\n", "names 3 columns .* above 6 .*; decimal commas need another separator"),
     ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F"), "disagree"),
     ("a.pcd", PCD.replace(b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1"), "bytes; expected at most"),
