@@ -83,7 +83,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             found += len(rows)
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             names = names or _names(before, table, path.suffix.lower(), report)
-            if any(plain_name(names[i]) in ARRAYS for i in unread):
+            if {names[i] for i in unread} & {*"xyz", *COLOR}:
                 raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
