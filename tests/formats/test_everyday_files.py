@@ -85,10 +85,10 @@ def test_a_header_of_bare_carriage_returns_ends_before_data_that_begins_with_a_l
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 
 
-def square_ply(kind: str, names, color) -> str:
+def square_ply(kind: str, names, color, corners=SQUARE) -> str:
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "".join(f"property {kind} {name}\n" for name in names)
-    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in SQUARE)
+    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in corners)
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
     return head + faces + rows + "3 0 1 2\n3 0 2 3\n"
 
@@ -228,11 +228,13 @@ def test_a_line_says_that_the_picture_will_be_black(tmp_path):
 
 def test_meshes_at_map_coordinates_keep_their_shape(tmp_path):
     content = "".join("v {:.4f} {:.4f} {:.4f}\n".format(*(UTM + 0.2 * corner)) for corner in SQUARE) + OBJ_FACE
-    placed = place_cloud(write(tmp_path, "a.obj", content), num_points=3000, up="y")
-    np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=2e-3)
-    back = placed.cloud.positions.astype(np.float64) @ placed.rotation + placed.origin
-    assert np.abs(back - (UTM + [0.1, 0.1, 0])).max() < 0.1001
-    assert len(np.unique(placed.cloud.positions[:, 1])) > 2000
+    floats_in_text = square_ply("float", RGB, (0, 1, 0), UTM + 0.2 * SQUARE)
+    for name, text in (("a.obj", content), ("a.ply", floats_in_text)):
+        placed = place_cloud(write(tmp_path, name, text), num_points=3000, up="y")
+        np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=2e-3)
+        back = placed.cloud.positions.astype(np.float64) @ placed.rotation + placed.origin
+        assert np.abs(back - (UTM + [0.1, 0.1, 0])).max() < 0.1001
+        assert len(np.unique(placed.cloud.positions[:, 1])) > 2000
 
 
 def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):

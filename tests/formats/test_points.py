@@ -167,13 +167,12 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     assert lines[0].startswith("an array of 20 x 21 x 3 taken as one cloud; of a batch")
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
-    x, y, z = BALL.T
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
     ignored = {"arr_3": np.arange(420), "arr_4": np.zeros((420, 9)), "arr_5": 3 * BALL}
     tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
     turned = {"vertices": BALL.T, "vertex_colors": opaque[:, :3].T}
     maps = {"pts3d": BALL.reshape(20, 21, 3), "point_rgb": opaque.reshape(20, 21, 4)}
-    separate = {"x": x, "y": y, "z": z, "rgb": opaque}
+    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque}
     for arrays in ({"arr_0": ROWS}, tables, separate, {"pc": np.array(ROWS)}, turned, maps):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
