@@ -198,7 +198,7 @@ def score_objects(
     scores, shown, to_show = {}, [], evaluation.pick_evenly(names, num_shown)
     for name in tqdm(names, desc="scoring"):
         item = data_sets.read_object(dataset, name)
-        item = dataclasses.replace(item, cloud=data_sets.test_cloud(item, config))
+        item = dataclasses.replace(item, cloud=data_sets.first_points(item, config.test_points))
         shows = {label: time_views(method, item, seconds[label]) for label, method in methods.items()}
         result = evaluation.evaluate_object(shows, config, item)
         for label, pictures in result.pictures.items():

@@ -79,7 +79,7 @@ class Part:
 
     positions (v, 3) float64; faces (f, 3) int64, counter-clockwise seen from outside where the source knows;
     normals (v, 3) unit, or None for flat shading; texcoords (v, 2), needed only if the material has a texture;
-    colors (v, 3) linear, multiplies the material's base colour, or None.
+    colors (v, 3) linear, multiplies the material's base colour, or None; alpha (v,) of any range, or None.
     """
 
     positions: np.ndarray
@@ -88,14 +88,14 @@ class Part:
     normals: np.ndarray | None = None
     texcoords: np.ndarray | None = None
     colors: np.ndarray | None = None
+    alpha: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Asset:
-    """One object: its parts, what kind it is, and what its source holds that is not modelled (named, never silent).
+    """One object: its parts, without faces if it is a file of points, and what its source holds that is not modelled.
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing.  The parts of a file
-    of points have vertices and no faces.
+    `notes` are sentences about what was made of transparent parts and of files that are missing.
     """
 
     parts: tuple[Part, ...] = ()
@@ -134,10 +134,9 @@ class Loading:
     def read(self, uri: str, needed: bool = False) -> bytes | None:
         """Bytes of the file that `uri` names (percent escapes as in glTF), or of a data URI; None where it is missing.
 
-        A name in a mesh file is somebody else's text.  It means the file at its longest end, in any letter case, that
-        is in the mesh's folder or in one above it up to the object's: nothing outside or on the network is read, and a
-        path of another machine still finds what lies beside the mesh.  UserError for a missing file that is `needed`,
-        as all are where the reading is strict.
+        A name means the file at its longest end, in any letter case, that is in the mesh's folder or in one above it up
+        to the object's: nothing outside or on the network is read, and a path of another machine still finds what lies
+        beside the mesh.  UserError for a missing file that is `needed`, as all are where the reading is strict.
         """
         if uri.startswith("data:"):
             head, _, payload = uri.partition(",")

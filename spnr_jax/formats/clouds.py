@@ -9,7 +9,6 @@
 
 `read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
 `place_cloud` also says how to get back into the file's frame.  Files of points are of any size, in bounded memory.
-What a file does not say is grey 0.5, roughness 0.5, metallic 0; `report` gets a line about every assumption.
 """
 
 from collections.abc import Iterable, Iterator
@@ -30,29 +29,19 @@ from spnr_jax.formats.columns import (
     POSITION,
     Columns,
     Report,
+    describe_use,
     keep_visible,
-    list_names,
     materials,
     normals,
     sound,
-    unused,
     useful,
 )
 from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import SurfacePoints, bounding_box, sample_surface, vertex_points
-from spnr_jax.kernels import scenes
+from spnr_jax.kernels import cloud_arrays, scenes
 from spnr_jax.kernels.cleaning import Clean, clean_columns
-from spnr_jax.kernels.cloud_arrays import (
-    THINNING,
-    farthest_points,
-    inner_box,
-    measure_spacing,
-    merge_repeats,
-    require_surface,
-    sample_stream,
-    stack_columns,
-)
+from spnr_jax.kernels.cloud_arrays import inner_box, measure_spacing, stack_columns
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels.normals import estimate_normals, face_sensor, outward_normals
 
@@ -70,7 +59,7 @@ LOST_STEP = 1e-3  # of the extent of an axis, from which on it is said that the 
 MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
 ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
 SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis, at which six digits leave a hundred values at most
-NO_DATA = -9999  # height of a grid's place without one
+NO_DATA = (-9999, -32767, -32768)  # heights of a grid's places without one
 SAMPLE = 512  # points at which the file's normals are compared with the points
 FEWEST = 10  # points that tell something of a surface
 LEAST_POINTS = 100  # that tell normals, and what has no colour
@@ -126,8 +115,7 @@ def read_cloud(
     """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
 
     The options are those of `Reading`.  Points that are thinned out have normals, the file's or those that all of its
-    points tell (surfels/normals.py).  Rows without finite numbers are left out.  ValueError, one line that names the
-    file, for whatever cannot be read.
+    points tell (surfels/normals.py).  ValueError, one line that names the file, for whatever cannot be read.
     """
     how = {"seed": seed, "clean": clean, "cut": cut, "transparent_parts": transparent_parts, "report": report}
     return place_cloud(path, num_points=num_points, up=up, **how).cloud
@@ -183,7 +171,7 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     kept = np.arange(len(points.positions))
     if count is not None and len(kept) > count:
         how.report(f"{count} of {len(kept)} points kept, evenly spread")
-        kept = np.sort(farthest_points(points.positions, count, how.seed, points.values.get("normals")))
+        kept = np.sort(cloud_arrays.farthest_points(points.positions, count, how.seed, points.values.get("normals")))
     positions, values, _ = points.take(kept)
     if "normals" not in values and sensor:
         values["normals"] = face_sensor(positions, points.positions, sensor.place - before, noise)
@@ -250,6 +238,8 @@ def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:
     unknown = [names for names, values, plain in fields if np.all(values == plain)]
     if sampled and len(unknown) < len(DEFAULTS):  # a material that has a common value
         unknown = []
+    if not sampled and all(part.alpha is not None for part in asset.parts):
+        fields.append((("alpha",), np.concatenate([part.alpha for part in asset.parts]), None))
     known = [(names, values.reshape(len(values), -1).T) for names, values, _ in fields if names not in unknown]
     return {name: column for names, columns in known for name, column in zip(names, columns, strict=True)}, sampled
 
@@ -274,14 +264,14 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
 def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
     """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
     cut, report = how.cut, how.report
-    capacity, broken, outside = max(CAPACITY, THINNING * (how.num_points or 0)), 0, 0
+    capacity, broken, outside = max(CAPACITY, cloud_arrays.THINNING * (how.num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
 
     def sound_pieces() -> Iterator[Columns]:
         nonlocal broken, outside, low, high
         for number, piece in enumerate(pieces):
-            if others := [] if number else unused(piece):
-                report(f"columns that are not used: {list_names(others)}")
+            for line in () if number else describe_use(piece):
+                report(line)
             columns = useful(piece)
             wanted = sound(columns)
             broken += int(np.count_nonzero(~wanted))
@@ -294,7 +284,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
                 wanted &= inside
             yield columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
-    columns, inside = sample_stream(sound_pieces(), capacity)
+    columns, inside = cloud_arrays.sample_stream(sound_pieces(), capacity)
     if not inside + outside:
         nothing = f"no point that can be used: {BROKEN} in all of its {broken} rows" if broken else "0 points"
         raise UserError(f"holds {nothing}")
@@ -324,23 +314,27 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
         report("normals of the file left out: none is a direction with a sign")
     if sampled:
         return Points(positions - origin, values, origin)
-    places, values, merged = merge_repeats(positions - origin, values)
+    places, values, merged = cloud_arrays.merge_repeats(positions - origin, values)
     if merged:
         report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
-    require_surface(places, len(positions))
+    cloud_arrays.require_surface(places, len(positions))
     if len(places) < FEWEST:
         report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)
 
 
 def _without_no_data(columns: Columns, report: Report) -> Columns:
-    """The points of a grid of heights without those whose height says that there is none."""
-    known = columns["z"] != NO_DATA
-    heights = columns["z"][known]
-    if not 0 < len(heights) < len(known) or heights.min() - NO_DATA < np.ptp(heights):
-        return columns
-    report(f"{len(known) - len(heights):,} points left out: their height is {NO_DATA}, no data")
-    return {name: column[known] for name, column in columns.items()}
+    """The points without those whose place, often 0 0 0 among others, or whose height says that there is none."""
+    positions = stack_columns(columns)
+    nowhere, low = np.asarray(~positions.any(axis=1)), np.isin(positions[:, 2], NO_DATA)
+    places, heights = positions[~nowhere], positions[~low, 2]
+    nowhere &= bool(nowhere.sum() > FEWEST and len(places) and np.ptp(places, axis=0).any())
+    low &= bool(len(heights) and heights.min() - NO_DATA[0] >= np.ptp(heights))
+    for what, mask in (("place is 0 0 0", nowhere), (f"height is {positions[:, 2].min():g}", low)):
+        if number := np.count_nonzero(mask):
+            report(f"{number:,} points left out: their {what}, no data")
+    kept = ~(nowhere | low)
+    return {name: column[kept] for name, column in columns.items()} if not kept.all() else columns
 
 
 def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> None:
@@ -365,7 +359,9 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
     if steps.max() > MOST_LOST * extent.max() > 0:
         found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
-    for axis, step, width, column in zip("xyz", steps, extent, positions.T, strict=True):
+    for axis, step, width, far, column in zip("xyz", steps, extent, farthest, positions.T, strict=True):
+        fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text, of numbers that were short
+        step = step or fits * np.spacing(np.float32(far))
         if step > LOST_STEP * width > 0:
             report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
     on_earth = farthest[:2].min() <= 90 and farthest[:2].max() <= 180

@@ -11,9 +11,7 @@
     classification withheld         of laser scans
 
 and drops the others.  Colours are sRGB unless the name says that they are linear.  Their range is that of the type for
-8-bit integers; of other numbers it is the first of 1, 255, 1023, 4095 and 65535 that nearly all of them keep to: some
-writers put 8-bit or 12-bit colours into 16-bit fields, or 0 to 255 into floats, and a single stray value must not turn
-the rest black.
+8-bit integers; else the first of 1, 100 (of fractions), 255, 1023, 4095 and 65535 that nearly all of them keep to.
 """
 
 import re
@@ -31,28 +29,34 @@ Report = Callable[[str], None]
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-PREFIX = "scalar_"  # CloudCompare's, for everything but positions and colours
+# of names: CloudCompare's word for all but positions and colours, separators, British spelling, and whose it is
+SILENT = re.compile(r"^scalar_|[\s.:_-]+|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)")
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
+PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
+PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
+PLANES, HEIGHTS = ("easting northing", "east north", "e n", "x y"), ("z", "height", "elevation", "altitude", "h")
 ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
     + [names.split() for names in others.split("|") if names]
     for ours, stems, others in (
-        (
-            *(POSITION, "points positions position point pos xyz vertices pc pcd coord coords location pointsmxyz p"),
-            "xm ym zm|xcoord ycoord zcoord|easting northing elevation|easting northing height|x y height|x y elevation",
-        ),
-        (LINEAR, "basecolor albedo", ""),
-        (SRGB, "color colors rgb diffuse vertex", "r g b|rf gf bf"),
+        (POSITION, PLACES, "|".join(f"{plane} {height}" for plane in PLANES for height in HEIGHTS)),
+        (LINEAR, "basecolor albedo cd", ""),  # the last is Houdini's
+        (SRGB, "color colors rgb rgbs diffuse vertex", "r g b|rf gf bf|fr fg fb|r8 g8 b8"),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
         (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
         (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
-        *(((name,), "", "") for name in ("rgb", "rgba", "opacity", "classification", "withheld", "splat_opacity")),
+        (("opacity",), "", "opacities"),
+        *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
 }
-ARRAYS = {name.removesuffix("0") for group in ALIASES.values() for names in group for name in names}
+# where none of these is there: columns whose names differ in one word, and do not speak of other things
+WORDS = ((POSITION, "x y z"), (SRGB, "r g b"), (SRGB, "red green blue"))
+OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera")
+NAMES = {name for group in ALIASES.values() for names in group for name in names}
+ARRAYS = {name.removesuffix("0") for name in NAMES}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
@@ -82,8 +86,18 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
 
 
 def plain_name(name: str) -> str:
-    """A name without its separators."""
-    return re.sub(r"[\s.:_-]+", "", name.strip().lower().removeprefix(PREFIX))
+    """A name in small letters without what says nothing."""
+    return SILENT.sub("", name.strip().lower())
+
+
+def _differing(columns: Columns, words: str) -> list[str]:
+    """Names of columns that differ in one word alone, which is each of these."""
+    first = rf"(?<![^\W_]){words.split()[0]}(?![^\W_])"
+    for name in columns:
+        names = [re.sub(first, word, name) for word in words.split()]
+        if re.search(first, name) and set(names) <= columns.keys() and not OTHERS.search(name):
+            return names
+    return []
 
 
 def rename(columns: Columns) -> Columns:
@@ -93,6 +107,9 @@ def rename(columns: Columns) -> Columns:
     for ours, theirs in ALIASES.items():
         names = next((names for names in theirs if set(names) <= plain.keys()), [])
         found |= dict(zip(ours, (plain[name] for name in names), strict=False))
+    for ours, words in WORDS:
+        if ours[0] not in found:
+            found |= dict(zip(ours, map(columns.__getitem__, _differing(columns, words)), strict=False))
     if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
             found[name] = np.clip(0.5 + C0 * np.asarray(columns[constant], np.float64), 0, 1)
@@ -105,17 +122,19 @@ def useful(columns: Columns) -> Columns:
     """The columns of points that matter, under their one name; ValueError if there are no positions."""
     found = rename(columns)
     if not set(POSITION) <= found.keys():
-        raise UserError(
-            "needs the properties x y z (and may have red green blue, roughness, metallic); "
-            f"found {' '.join(columns) or 'none'}"
-        )
+        names = " ".join(columns) or "none"
+        raise UserError(f"needs the properties x y z (and may have red green blue, roughness, metallic); found {names}")
     return found
 
 
-def unused(columns: Columns) -> list[str]:
-    """Names of the columns of points that do not matter, but for those of splats."""
-    used = {id(values) for values in rename(columns).values()}
-    return [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
+def describe_use(columns: Columns) -> list[str]:
+    """Lines about the columns of points that do not matter, but for those of splats, and about names that are new."""
+    used = {id(x): ours for ours, x in rename(columns).items()}
+    left = [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
+    new = [name for name, x in columns.items() if id(x) in used and plain_name(name) not in NAMES]
+    guessed = [f"{name} as {used[id(columns[name])]}" for name in new]
+    lines = {"columns that are not used": left, "columns taken by a word of their names": guessed}
+    return [f"{line}: {list_names(names)}" for line, names in lines.items() if names]
 
 
 def list_names(names: list[str]) -> str:
@@ -125,7 +144,8 @@ def list_names(names: list[str]) -> str:
 
 def sound(columns: Columns) -> np.ndarray:
     """Mask (points,) of rows whose position, colour, opacity and materials are numbers that float32 holds."""
-    mask, largest = np.ones(len(columns["x"]), bool), np.finfo(np.float32).max
+    # of which text has not all digits
+    mask, largest = np.ones(len(columns["x"]), bool), 0.999 * np.finfo(np.float32).max
     for name in columns.keys() - {*NORMAL, "intensity", "rgb", "rgba", "classification", "withheld"}:
         values = np.asarray(columns[name], np.float64)
         # infinite is what an opacity of 0 or 1 is before the logistic function
@@ -140,7 +160,7 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
     """
     wanted = np.ones(len(columns["x"]), bool)
     left_out = {
-        "opacity near 0": _invisible(columns),
+        "opacity near 0": invisible(columns),
         "noise in their classification (7, 18)": np.isin(columns.get("classification", ~wanted), NOISE_CLASSES),
         "withheld by the scanner's software": columns.get("withheld", ~wanted) != 0,
     }
@@ -155,7 +175,7 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
     return columns if wanted.all() else {name: column[wanted] for name, column in columns.items()}
 
 
-def _invisible(columns: Columns) -> np.ndarray:
+def invisible(columns: Columns) -> np.ndarray:
     """True for points that hide next to nothing; for none where the file does not say so, or says it of all."""
     nothing = np.zeros(len(columns["x"]))
     values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
@@ -262,7 +282,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
         return np.zeros(channels.shape), []
     strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
     highest = np.partition(channels.max(axis=-1), -1 - strays)[-1 - strays]
-    white = full_scale(channels.dtype, float(highest), linear)
+    percent = not linear and channels.dtype.kind == "f" and 2 < highest <= 100 and (channels[:LEAST] % 1).any()
+    white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear)
     low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
     if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
         raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")

@@ -1,7 +1,4 @@
-"""Data sets on disk, read: what they hold, and their objects as NumPy arrays.
-
-A data set is the folder that `spnr-data generate` writes (its form: docs/data.md).
-"""
+"""Data sets on disk, read: objects as NumPy arrays; the form of what `spnr-data generate` writes: docs/data.md."""
 
 import io
 import json
@@ -85,9 +82,8 @@ def open_dataset(folder: Path | str) -> Dataset:
 
 def is_plain_name(name: str) -> bool:
     """Whether a name in a data set's lists is that of a folder right there: no path, nothing hidden."""
-    return (
-        0 < len(name) <= LONGEST_NAME and name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
-    )
+    plain = name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
+    return plain and 0 < len(name) <= LONGEST_NAME
 
 
 def read_object(dataset: Dataset, name: str) -> ObjectData:
@@ -143,20 +139,9 @@ def on_white(rgba: np.ndarray) -> np.ndarray:
     return color * alpha + (1 - alpha)
 
 
-def test_cloud(item: ObjectData, config: TrainConfig) -> PointCloud:
-    """The object's first `test_points` points: always the same ones."""
-    return first_points(item, config.test_points)
-
-
 def first_points(item: ObjectData, count: int) -> PointCloud:
     """So many points of an object, or all if it has fewer: always the same ones."""
     return jax.tree.map(lambda values: values[:count], item.cloud)
-
-
-def check_renders(data: ObjectData, config: TrainConfig) -> None:
-    """ValueError if the config's network cannot render an object's views: one size alone, or any."""
-    if not config.model.any_size:
-        check_resolution(data, config)
 
 
 def check_resolution(data: ObjectData, config: TrainConfig) -> None:

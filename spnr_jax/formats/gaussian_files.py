@@ -4,12 +4,10 @@
             function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
     .spz    gzip; a header of 16 bytes, then all places (24-bit fixed point an axis), all opacities (8 bits), colours,
             logarithms of scales, rotations (32 bits), harmonics; axes right, up, back.  Versions 2 and 3 are read
-    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats, which store their place in it as 11, 10
-            and 11 bits, and their colour and opacity as 8 bits each
+    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats; places in it have 11, 10 and 11 bits
 
 The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
-with y up and z towards the viewer, in any unit.  A note, which names the cloud, the network and the light, becomes a
-comment of the .ply; a .spz has no place for one.  What is read are coloured points; `splat_opacity` is 0 to 1.
+with y up and z towards the viewer, in any unit; a note becomes a comment of the .ply.  Read are coloured points.
 """
 
 import gzip
@@ -86,21 +84,16 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
         "rot_0 rot_1 rot_2 rot_3": splats.rotation,
     }
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {x}" for x in (RENDER_MODE, *note.splitlines()))]
-    header += [
-        f"element vertex {len(opacity)}",
-        *(f"property float {x}" for x in " ".join(columns).split()),
-        "end_header",
-    ]
+    properties = [f"property float {name}" for name in " ".join(columns).split()]
+    header += [f"element vertex {len(opacity)}", *properties, "end_header"]
     rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
     return ("\n".join(header) + "\n").encode("ascii", "replace") + rows.tobytes()
 
 
 def spz_of(gaussians: Gaussians) -> bytes:
     """The splats as a .spz file."""
-    position, scale, rotation, opacity, harmonics = (
-        np.asarray(getattr(gaussians, name), np.float64)
-        for name in ("position", "scale", "rotation", "opacity", "harmonics")
-    )
+    names = "position", "scale", "rotation", "opacity", "harmonics"
+    position, scale, rotation, opacity, harmonics = (np.asarray(getattr(gaussians, x), np.float64) for x in names)
     bits = int(np.clip(FRACTION_BITS - np.ceil(np.log2(max(np.abs(position).max(), 1e-6))), 0, 31))
     fixed = np.clip(np.round(position * 2.0**bits), -(2**23), 2**23 - 1).astype("<i4")
     step = 2.0 ** (8 - np.where(np.arange(harmonics.shape[1] - 1) < 3, *HARMONIC_BITS))[:, None]

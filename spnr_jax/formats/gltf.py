@@ -1,13 +1,12 @@
 """glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node, in its rest pose.
 
-Read here and not through trimesh 5.2, whose reader leaves normalised integers unscaled, drops triangle fans, and shows
-a compressed file as vertices at the origin; tests compare the rest with trimesh.  DracoPy (KHR_draco_mesh_compression)
-and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
+Read here and not through trimesh, which leaves integers unscaled and drops fans (docs/lab/readers.md); tests compare
+the rest with it.  DracoPy (KHR_draco_mesh_compression) and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
-reference converter.  A material has one set of coordinates, that of the first texture that is read; another texture
-that lies differently is replaced by its mean.  What is not modelled is named in `ignored`.
+reference converter.  A material has one set of coordinates, that of its first texture; a texture that lies differently
+is replaced by its mean.  What is not modelled is named in `ignored`.
 """
 
 import json
@@ -93,9 +92,11 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
-        if asks_alpha and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
-            ignored.add("alpha of vertex colours")
-        parts.append(_place(columns, faces, material, placement, matrix))
+        part = _place(columns, faces, material, placement, matrix)
+        if (asks_alpha or mode == "POINTS") and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
+            ignored |= {"alpha of vertex colours"} if asks_alpha else set()
+            part = replace(part, alpha=columns["COLOR_0"][:, 3])
+        parts.append(part)
     return parts
 
 
@@ -326,11 +327,7 @@ def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
 
 
 def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:
-    """Where a texture lies.
-
-    Rotations are counter-clockwise in a frame whose v runs down, as the extension's words and examples say (its GLSL
-    snippet turns the other way).
-    """
+    """Where a texture lies; rotations are counter-clockwise where v runs down (the extension's GLSL turns back)."""
     sampler = file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
     wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
     if wrap != wrap_t:

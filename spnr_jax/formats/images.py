@@ -4,7 +4,6 @@ Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1],
 place and renamed into it: a reader sees the old content or the new, never half of it.
 
 A light comes from an environment map (.hdr .exr), which mitsuba reads, or by the name of one of the package's.
-Pages load nothing from elsewhere; their look is one style sheet, pages.css: light, no fonts.
 """
 
 import base64
@@ -166,13 +165,9 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
 
 def template(path: Path) -> Template:
     """The template of a page in a file; a name that it uses and is not given is an error."""
-    return Environment(
-        loader=FileSystemLoader([path.parent, Path(__file__).parent]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    ).get_template(path.name)
+    files = FileSystemLoader([path.parent, Path(__file__).parent])
+    pages = Environment(loader=files, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return pages.get_template(path.name)
 
 
 def read_light(source: Path | str, normalise: bool = True) -> Light:

@@ -1,9 +1,8 @@
 """Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
-Coordinates come scaled and shifted as the header says, in float64; colours are 16 bit.  What the header announces is
-compared with the size of the file before laspy, which takes memory and time for whatever is announced, sees it; and
-lazrs, which unpacks .laz, ends the whole process where a size in the file is too large, which no `except` sees.  So the
-sizes are walked through before (LASzip specification, LAZ 1.4 R1):
+What the header announces is compared with the size of the file before laspy, which takes memory and time for whatever
+is announced, sees it; and lazrs, which unpacks .laz, ends the whole process where a size in the file is too large.  So
+the sizes are walked through before (LASzip specification, LAZ 1.4 R1):
     record 22204 of "laszip encoded"   ... chunk size u32 at 12, number of items u16 at 32, items (type, size, version)
     at the points' place   i64 place of the chunk table (-1: it stands in the last 8 bytes), then the chunks
     chunk of layers        first point as it is, u32 number of points, u32 size of each layer, the layers
@@ -19,7 +18,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import extra
-from spnr_jax.formats.columns import Columns, Report
+from spnr_jax.formats.columns import Columns, Report, name_columns
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
@@ -34,7 +33,7 @@ COMPRESSED = 0xC0  # bits of the point format
 
 
 def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns x y z, the colours and the intensity of a scan, some points at a time."""
+    """The columns x y z, the colours, the intensity and the extra bytes of a scan, some points at a time."""
     laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -48,10 +47,11 @@ def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
             refusing("is a broken or truncated LAS file"),
             laspy.open(path, laz_backend=backends, read_evlrs=False) as scan,
         ):
-            present = set(scan.header.point_format.dimension_names)
+            own = scan.header.point_format
+            names = [*({*COLUMNS} & {*own.dimension_names}), *own.extra_dimension_names]
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
-                yield columns | {name: np.asarray(points[name]) for name in COLUMNS if name in present}
+                yield columns | name_columns({name: np.asarray(points[name]) for name in names})
     except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
         if type(error).__name__ != "PanicException":
             raise
@@ -69,9 +69,7 @@ def _check_sizes(content: mmap.mmap) -> int:
         raise UserError(f"is broken: {records} records in its header, points from byte {data} of {len(content)} on")
     if not kind & COMPRESSED:
         if not length or data + points * length > len(content):
-            raise UserError(
-                f"is cut off: its header announces {points} points of {length} bytes in {len(content)} bytes"
-            )
+            raise UserError(f"is cut off: {points} points of {length} bytes are announced in {len(content)} bytes")
         further = content[25] == 3 or (content[25] > 3 and any(content[EVLRS : EVLRS + 4]))  # other things behind them
         return 0 if further else (len(content) - data) // length - points
     for _ in range(records):
@@ -95,9 +93,7 @@ def _check_sizes(content: mmap.mmap) -> int:
     most = LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size
     # each chunk begins with a point as it is
     if sum(size for _, size in items) != length or not 0 < most <= LARGEST_CHUNK or table < 0:
-        raise UserError(
-            f"is broken: points of {length} bytes in items {items}, chunks of {chunk_size}, table at {table}"
-        )
+        raise UserError(f"is broken: points of {length} bytes, items {items}, chunks of {chunk_size}, table at {table}")
     if chunks * length > len(content) or chunks * most < points:
         raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
     place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)

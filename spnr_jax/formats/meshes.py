@@ -17,6 +17,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats.assets import CHANNELS, Asset, Loading, Material, Part, TransparentParts, make_material
+from spnr_jax.formats.columns import invisible
 from spnr_jax.formats.gltf import load_gltf
 from spnr_jax.formats.obj import load_obj
 from spnr_jax.formats.polygons import PLAIN
@@ -38,10 +39,10 @@ def load_mesh(
     """The object in a mesh file, parts merged by material; `source` names the file and its checksum.
 
     `root` is the object's folder, which may hold an .obj file's companions above it (default: the file's folder).
-    UserError, with one line, for a file that cannot be used: unreadable or truncated, without faces or extent,
-    with buffers missing or outside its folder.  "refuse", for references, also refuses what is transparent and images
-    and libraries that are missing; "opaque" and "skip", for pictures, say in `notes` what was made of them, leave out
-    faces whose vertices are not finite, and read what the renderer of references does not know: cut-outs, normal maps.
+    UserError for a file that cannot be used: unreadable or truncated, without faces or extent, with buffers missing.
+    "refuse", for references, also refuses what is transparent and images and libraries that are missing; "opaque" and
+    "skip", for pictures, say in `notes` what was made of them, leave out faces that are invisible or not finite, and
+    read what the renderer of references does not know: cut-outs, normal maps.
     `kind` is a suffix to go by instead of the file's.
     """
     path = Path(path)
@@ -70,7 +71,7 @@ def assemble(parts: list[Part], loading: Loading) -> list[Part]:
     """The parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
     if not parts:
         raise UserError(f"has nothing to draw: {'; '.join(notes)}" if (notes := loading.notes()) else "has no faces")
-    parts = parts if loading.strict else _without_false_normals(_finite(parts, loading), loading)
+    parts = parts if loading.strict else _without_false_normals(_visible(parts, loading), loading)
     low, high = bounding_box(Asset(parts=tuple(parts)))
     smallest, degenerate = DEGENERATE_AREA * np.sum((high - low) ** 2), 0
     groups: dict[tuple, list[Part]] = {}
@@ -98,12 +99,19 @@ def _check_columns(part: Part) -> None:
         raise UserError(f"has faces that name vertices {first} to {last} of {count}: broken file")
 
 
-def _finite(parts: list[Part], loading: Loading) -> list[Part]:
-    """The parts without faces that have a vertex which is not finite, and a note about how many these are."""
-    sound = [np.isfinite(part.positions[part.faces]).all(axis=(1, 2)) for part in parts]
-    if lost := sum(int((~faces).sum()) for faces in sound):
-        loading.say(f"{lost:,} {'face' if lost == 1 else 'faces'} left out for a vertex that is NaN or infinity")
-    return [replace(part, faces=part.faces[faces]) for part, faces in zip(parts, sound, strict=True)]
+def _visible(parts: list[Part], loading: Loading) -> list[Part]:
+    """The parts without faces that have a vertex which is not finite, or invisible ones alone; notes count these."""
+    lost = {"for a vertex that is NaN or infinity": 0, "for the alpha of their vertices, near 0": 0}
+    for number, part in enumerate(parts):
+        hidden = invisible({"x": part.positions[:, 0]} | ({} if part.alpha is None else {"alpha": part.alpha}))
+        broken = ~np.isfinite(part.positions[part.faces]).all(axis=(1, 2))
+        masks = broken, hidden[part.faces].all(axis=1) & ~broken & ~hidden.all()
+        lost = {reason: count + int(mask.sum()) for (reason, count), mask in zip(lost.items(), masks, strict=True)}
+        parts[number] = replace(part, faces=part.faces[~np.any(masks, axis=0)])
+    for reason, count in lost.items():
+        if count:
+            loading.say(f"{count:,} {'face' if count == 1 else 'faces'} left out {reason}")
+    return parts
 
 
 def _without_false_normals(parts: list[Part], loading: Loading) -> list[Part]:
@@ -124,7 +132,7 @@ def _clean_part(part: Part, loading: Loading) -> Part:
     """The part with just the vertices that its faces use, in their order, and the columns that its material needs."""
     used, faces = np.unique(part.faces, return_inverse=True)
     columns: dict[str, Any] = {name: values[used] for name in WIDTHS if (values := getattr(part, name)) is not None}
-    part = replace(part, **columns, faces=faces.reshape(-1, 3).astype(np.int64))
+    part = replace(part, **columns, alpha=None, faces=faces.reshape(-1, 3).astype(np.int64))
     part = replace(part, normals=_unit_normals(part, loading.ignored), colors=_check_colors(part, loading.ignored))
     look, texcoords = part.material, part.texcoords
     if not any(np.ndim(getattr(look, name)) > axes for name, axes in CHANNELS.items()):
@@ -173,18 +181,14 @@ def _check_colors(part: Part, ignored: set[str]) -> np.ndarray | None:
 
 def _identity(material: Material) -> tuple:
     """Everything that a material says, with digests of its textures."""
-    return tuple(
-        (np.shape(x), hashlib.sha256(x.tobytes()).digest()) if isinstance(x, np.ndarray) else x
-        for x in vars(material).values()
-    )
+    values = vars(material).values()
+    return tuple((x.shape, hashlib.sha256(x.tobytes()).digest()) if isinstance(x, np.ndarray) else x for x in values)
 
 
 def _merge(parts: list[Part]) -> Part:
     """One part of several that agree in material and in having normals; missing colours are white."""
-    if any(part.colors is not None for part in parts):
-        parts = [
-            part if part.colors is not None else replace(part, colors=np.ones_like(part.positions)) for part in parts
-        ]
+    tinted = any(part.colors is not None for part in parts)
+    parts = [replace(x, colors=np.ones_like(x.positions)) if tinted and x.colors is None else x for x in parts]
     names = [name for name in WIDTHS if getattr(parts[0], name) is not None]
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     first = np.cumsum([0, *(len(part.positions) for part in parts)])

@@ -3,8 +3,7 @@
 Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
 a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (a
 cut-out at a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with
-the same three corners, in either order, one is kept, that of the material used first: ShapeNet has many, one for each
-side, and a ray could not tell which it hits.
+the same three corners, as ShapeNet has for the two sides, one is kept, that of the material used first.
 """
 
 import re
@@ -133,15 +132,8 @@ def _parts(
     for code in np.unique(kind):
         material = list(looks.values())[code // 4]
         assert material is not None
-        part = Part(
-            positions=positions,
-            faces=faces[kind == code],
-            material=material,
-            normals=normals if code & 1 else None,
-            texcoords=texcoords if code & 2 else None,
-            colors=colors,
-        )
-        parts.append(part)
+        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
+        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=texcoords if code & 2 else None))
     return parts
 
 

@@ -12,9 +12,9 @@ crowd    it does not end in a panel: the larger share of the points within BASE 
 Of 78 real objects 72 are found upright as they are and 71 turned to z up (docs/lab/readers.md); for the others there is
 `--up`.
 
-PCD headers and PLY camera elements name the place of a sensor.  Every point was seen from there, so that its normal
-points to it; and a camera's own axes say which way is up.  The place 0 0 0 that writers of PCD put there for want of a
-better one is believed if nothing hides the points from it, another place if it sees most of them.
+PCD headers and PLY camera elements name the place of a sensor, to which normals point; a camera's axes say which way is
+up.  The place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from
+it, another place if it sees most of them.
 """
 
 from collections.abc import Callable

@@ -4,8 +4,7 @@ READERS says which module reads which kind: points from row_files.py (.ply .pcd)
 .npy), las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
 
 A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
-may be larger than the memory.  Columns are raw: names and types are those of the file, positions float64 where the file
-has them so; what they mean is the affair of spnr_jax/formats/columns.py.
+may be larger than the memory.  Columns have the names and types of the file; columns.py says what they mean.
 """
 
 import io

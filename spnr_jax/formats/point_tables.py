@@ -1,16 +1,14 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
-Numbers of text are separated by commas, semicolons or blanks, also behind the last one; a decimal comma is told by that
-nothing else separates there, or by quotes.  Lines of one whole number count the points.  A header line names the
-columns, also behind #, % or //, with units in brackets; a column without a name is a table's index.  Without a header
-the values tell what stands behind x y z: normals, r g b, alpha, roughness, metallic, intensity, or any other number.
+Numbers of text are separated by commas, semicolons, bars or blanks, also behind the last one; a decimal comma is told
+by that nothing else separates there, or by quotes.  Lines of one whole number count the points.  A header line names
+the columns, also behind #, % or //; one without a name is an index, one of words is not read.  Without a header the
+values tell what stands behind x y z: normals, r g b, alpha, roughness, metallic, intensity, or any other number.
 
-    .npz    arrays (points, c) or (points,), whose names are those of columns; of the points as in text without a
-            header, also of arrays without names; they come whole where they are compressed
+    .npz    arrays (points, c) or (points,), whose names are those of columns; of the points as in text without a header
     .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
 
-Pickled objects, which could run code, are refused.  Every fault is a ValueError that says what is wrong with the file,
-of text also in which line; its name is added by the caller.
+Pickled objects, which could run code, are refused.
 """
 
 import contextlib
@@ -26,7 +24,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import ARRAYS, NORMAL, POSITION, Columns, Report, list_names, name_columns, plain_name
+from spnr_jax.formats.columns import ARRAYS, NORMAL, PLACES, Columns, Report, list_names, name_columns, plain_name
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
@@ -42,20 +40,18 @@ NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", r
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
-UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)", re.IGNORECASE)  # as the libraries of Windows write it
-UNITS = re.compile(r"[(\[][^)\]]*[)\]]")
-UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
+UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of Windows, of databases
+UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^)\]]*[)\]]")  # no numbers: CloudCompare's roughness by radius is no material
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
 UNNAMED = tuple(f"arr{i}" for i in range(9))  # names by np.savez of arrays that were given none
-POINTS = ("positions", "points", "xyz", "vertices", "pc", "pcd", "pos", "coord", "coords", "arr0")
 
 
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; a line before the numbers may name them."""
     with open_text(path) as file:
-        numbered = ((number, _unquote(line.strip())) for number, line in enumerate(file, 1))
+        numbered = ((number, _unquote(line.strip().replace("|", ";"))) for number, line in enumerate(file, 1))
         before, first = _split_header(numbered)
         if not first[1]:
             remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
@@ -64,6 +60,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         parts = first[1].split()
         if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
             delimiter = None  # these are decimal commas
+        headers = {line for line in before if not NUMBER.match(line)}  # come again where files were joined
         announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
 
         def rows_of_numbers() -> Iterator[Line]:
@@ -71,18 +68,21 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             for number, text in chain([first], numbered):
                 if text.isdecimal():
                     announced += int(text[:SHOWN])
-                elif text and not text.startswith(COMMENTS):
+                elif text and not text.startswith(COMMENTS) and text not in headers:
                     text = EMPTY.sub("nan", text) if delimiter else text
                     yield number, text if delimiter == "," else text.replace(",", ".")
 
         lines = rows_of_numbers()
         names: tuple[str, ...] = ()
         found = 0
+        words = [word.replace(",", ".") for word in first[1].split(delimiter)]
+        unread = {i: lambda word: np.nan for i, word in enumerate(words) if not _is_number(word)}
         while rows := list(islice(lines, PIECE_LINES)):
-            words = rows[0][1].split(delimiter)
-            count, found = len(names) or len(words), found + len(rows)
-            table = load_text(rows, "line", count, delimiter, ndmin=2)
+            found += len(rows)
+            table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             names = names or _names(before, table, path.suffix.lower(), report)
+            if {names[i] for i in unread} & {*"xyz", *COLOR}:
+                raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -98,12 +98,23 @@ def open_text(path: Path) -> TextIO:
 
 def encoding_of(head: bytes) -> str:
     """The encoding of text that begins so."""
-    return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
+    if 0 in head[:2]:
+        return "utf-16-le" if head[0] else "utf-16-be"
+    return "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
 def _unquote(text: str) -> str:
     """A line without quotes; a comma inside of them is a decimal one."""
     return re.sub('"([^"]*)"?', lambda found: found[1].replace(",", "."), text) if '"' in text else text
+
+
+def _words(line: str) -> list[str]:
+    """The fields of a line, between the separators that it has."""
+    return [word.strip("' \t") for word in line.split(next((mark for mark in ";," if mark in line), None))]
+
+
+def _is_number(word: str) -> bool:
+    return bool(not word.strip() or NUMBER.fullmatch(word.strip()) or UNDEFINED.fullmatch(word.strip()))
 
 
 def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
@@ -112,7 +123,9 @@ def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
     for number, line in lines:
         words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
         numbered = words == list(map(str, range(len(words))))  # as pandas names an array's columns
-        if NUMBER.fullmatch(words[0]) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
+        fields, above = ([*map(_is_number, _words(text))] for text in (line[:LONGEST_HEADER], ["", *before][-1]))
+        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # perhaps behind a word
+        if (NUMBER.fullmatch(words[0]) or below_names) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
             return [*before], (number, line)
         before.append(line[:LONGEST_HEADER])
     return [*before], (0, "")
@@ -151,8 +164,7 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
     unfit: list[str] = []
     for line in reversed(before):
         text = UNITS.sub("", line.lstrip("#/% "))
-        mark = next((mark for mark in ";," if mark in text), None)
-        names = [name.strip("' \t").lower() for name in text.split(mark)]
+        names = [name.lower() for name in _words(text)]
         while len(names) > filled and not names[-1]:
             names.pop()
         is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
@@ -163,10 +175,13 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
     if names := next((names for names in found if "x" in names), [*found, []][0]):
         names += [""] * (count - len(names))  # separators behind the last number
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
+    if len(unfit) == count - 1 and len(table) > 1 and (np.diff(table[:, 0]) == 1).all():  # as R writes a table
+        return (INDEX, *unfit)
     if unfit:
-        raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers")
+        hint = "; decimal commas need another separator" if count == 2 * len(unfit) else ""
+        raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers{hint}")
     of_format = suffix == ".pts" and filled == 7
-    told = (*POSITION, "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
+    told = (*"xyz", "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
     return (*told, *[INDEX] * (count - filled))
 
 
@@ -179,17 +194,18 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     if count < 3 or count == 5 or count > MOST_COLUMNS:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of x y z "
-            "and what may stand behind them (intensity, r g b, nx ny nz, roughness metallic), or a header line that "
-            "names the columns"
+            "(then intensity, r g b, nx ny nz, roughness metallic), or a header line that names the columns"
         )
     steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
     timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
-    if timed or np.all(steps == 1):
-        report("the first column, which grows steadily, taken as a number or a time of each point")
-        return (INDEX, *plain_names(table[:, 1:], report))
+    whole = (table % 1 == 0).all(axis=0)
+    pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # by row and column
+    if first := 2 if pictured else int(timed or np.all(steps == 1)):
+        report(f"columns before x y z, which number or time the points: {first}")
+        return (*first * [INDEX], *plain_names(table[:, first:], report))
     if (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
-    names, threes = [*POSITION, *["scalar"] * (count - 3)], range(3, count - 2)
+    names, threes = [*"xyz", *["scalar"] * (count - 3)], range(3, count - 2)
     for i in [i for i in threes if _are_normals(table[:, i : i + 3], table[:, :3])][:1]:
         names[i : i + 3] = NORMAL
     free = [i for i in threes if names[i : i + 3] == 3 * ["scalar"]]
@@ -239,8 +255,9 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         magic = file.read(6)
         file.seek(0)
         if magic.startswith(b"PK"):
-            arrays = read_arrays(file, (*POINTS, *ARRAYS, *UNNAMED), report)
-            yield _archive_columns({plain_name(name): array for name, array in arrays.items()}, report)
+            arrays = read_arrays(file, (*PLACES.split(), *ARRAYS, *UNNAMED), report)
+            tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
+            yield _archive_columns(tables, report)
             return
     if not magic.startswith(b"\x93NUMPY"):
         raise UserError("is not a NumPy file")
@@ -253,15 +270,24 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    if rows.ndim == 3 and min(rows.shape[:2]) > 1:
-        report(f"an array of {' x '.join(map(str, rows.shape))} taken as one cloud; of a batch, save array[0] alone")
     fields = rows.dtype.names
-    rows = rows.reshape(-1) if fields else rows.reshape(-1, rows.shape[2]) if rows.ndim == 3 else rows
+    rows = rows.reshape(-1) if fields else _as_rows(rows, report)
     names = fields or plain_names(rows[:PIECE_LINES], report)
     step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
     for start in range(0, max(1, len(rows)), step):
         piece = np.array(rows[start : start + step])
         yield name_columns({name: piece[name] if fields else piece[:, i] for i, name in enumerate(names)})
+
+
+def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
+    """A table with one row for each point: maps (h, w, c) of pictures, and tables (c, points), become (points, c)."""
+    if array.ndim == 3 and min(array.shape[:2]) > 1:
+        report(f"an array of {' x '.join(map(str, array.shape))} taken as one cloud; of a batch, save array[0] alone")
+    table = array.reshape(-1, array.shape[2]) if array.ndim == 3 else array
+    if table.ndim < 2 or not 3 <= len(table) <= MOST_COLUMNS < table.shape[1]:
+        return table
+    report(f"an array of {len(table)} x {table.shape[1]} taken as one column for each point")
+    return table.T
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
@@ -274,10 +300,7 @@ def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> b
 def read_arrays(
     file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
 ) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive, those that are wanted; ValueError if it is broken or unpacks to too much.
-
-    `report` gets a line about the others.
-    """
+    """The wanted arrays of an .npz archive, a line about others; ValueError if broken, or if it unpacks to too much."""
     with refusing("is a broken or truncated NumPy file"), PARSER, np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
@@ -297,7 +320,7 @@ def read_arrays(
 def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
     """The columns of arrays (points, c), or (points,) for scalars; of those without a name all that are as long."""
     columns: Columns = {}
-    if name := next((name for name in POINTS if name in arrays), None):
+    if name := next((name for name in (*PLACES.split(), "arr0") if name in arrays), None):
         table = np.atleast_2d(arrays.pop(name))
         unnamed = [arrays.pop(other) for other in UNNAMED if other in arrays]
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]

@@ -142,11 +142,11 @@ def _colored(
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     if {"roughness", "metallic"} & columns.keys():
         loading.ignored.add("roughness and metallic of vertices")
-    colors, notes = colors_of(columns) or (None, [])
+    alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
     if colors is None and (found := colors_of(rename(of_faces))) is not None:
-        positions, normals = positions[faces.ravel()], None
+        positions, normals, alpha = positions[faces.ravel()], None, None if alpha is None else alpha[faces.ravel()]
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
-    return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors)]
+    return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]

@@ -3,12 +3,10 @@
 .ply    ASCII or binary, any order and scalar types.  The header names the elements and their properties; the vertices
         may stand behind other elements, and have lists, which are stepped over
 .pcd    of the Point Cloud Library, 0.6 and 0.7: ASCII, binary or LZF-compressed.  The header names the fields with
-        their sizes, types (F, I, U) and counts; then come the points, row by row, or, compressed, one column after the
-        other
+        their sizes, types (F, I, U) and counts; then come the points, row by row, or, compressed, column by column
 
 Both say the same of a row: its properties, each a name, a type, and how many numbers (of a list the type of the number
-that says it).  Only one piece of a file is in memory at a time; compressed ones are read whole.  Every fault is a
-ValueError that says what is wrong; the file's name is added by the caller.
+that says it).  Only one piece of a file is in memory at a time; compressed ones are read whole.
 """
 
 import contextlib
@@ -258,6 +256,7 @@ def _ply_header(file: BufferedIOBase) -> Header:
     file.seek(end.end())
     for _, _, own in elements:
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
+        own[:] = [(name, kind.replace("=f4", "=f8"), width) for name, kind, width in own]  # text has all digits
     return Header("ascii" if order == "=" else "binary", elements, tuple(textures))
 
 
@@ -279,6 +278,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
         counts = map(int, entries.get("COUNT", ["1"] * len(names)))
         num_points = int((entries.get("POINTS") or entries["WIDTH"])[0])
         types = [KINDS[kind] + str(int(size)) for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)]
+        types = [kind if encoding != "ascii" else kind.replace("<f4", "<f8") for kind in types]  # text has all digits
         # padding is called "_" and may come several times
         plain = [name if name != "_" else f"_{i}" for i, name in enumerate(names)]
         properties: Properties = list(zip(map(str.lower, plain), types, counts, strict=True))

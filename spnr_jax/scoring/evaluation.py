@@ -106,7 +106,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, 
     def mean_psnr(factor: float) -> float:
         values = []
         for item in items:
-            image, _ = render_floor(method, data_sets.test_cloud(item, config), item.camera, factor)
+            image, _ = render_floor(method, data_sets.first_points(item, config.test_points), item.camera, factor)
             values.append(metrics.psnr(image, jnp.asarray(data_sets.on_white(item.images))))
         return float(np.mean(values))
 
@@ -136,12 +136,13 @@ def make_floor(name: str, factor: float = 1.0) -> Method:
 
 def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
     """Pictures and scores of one object."""
-    data_sets.check_renders(item, config)
+    if not config.model.any_size:
+        data_sets.check_resolution(item, config)
     if item.lights is not None:
         raise UserError(
             f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
         )
-    cloud = data_sets.test_cloud(item, config)
+    cloud = data_sets.first_points(item, config.test_points)
     pictures, scores = {}, {}
     for method, show in methods.items():
         shown = show(cloud, item.camera)

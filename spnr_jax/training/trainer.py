@@ -181,7 +181,7 @@ def preview(
     columns, scores = [], []
     for name in names:
         item = data_sets.read_object(dataset, name)
-        cloud = data_sets.test_cloud(item, config)
+        cloud = data_sets.first_points(item, config.test_points)
         rendering = render_views(variables, config.model, cloud, item.camera, item.own_lights or light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))

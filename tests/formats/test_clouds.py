@@ -48,7 +48,8 @@ def materials(folder, **columns):
 NAMES = {  # of channels, and the linear value of 0.5 in them
     **dict.fromkeys(("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "rf gf bf"), LEVEL),
     **dict.fromkeys(("color_red color_green color_blue", "scalar_r scalar_g scalar_b"), LEVEL),
-    **dict.fromkeys(("base_color_r base_color_g base_color_b", "albedo_r albedo_g albedo_b"), 0.5),
+    **dict.fromkeys(("colour_r colour_g colour_b", "vertex_color_r vertex_color_g vertex_color_b"), LEVEL),
+    **dict.fromkeys(("base_color_r base_color_g base_color_b", "albedo_r albedo_g albedo_b", "Cd.r Cd.g Cd.b"), 0.5),
 }
 
 
@@ -73,9 +74,7 @@ def test_packed_colours_are_whole_numbers_of_any_type_or_have_their_bits(tmp_pat
     [("roughness", "scalar_metallic"), ("scalar_roughness", "metalness"), ("pbr_roughness", "metal")],
 )
 def test_roughness_and_metallic_have_many_names_and_whole_bytes(tmp_path, rough, metal):
-    _, roughness, metallic, lines = materials(
-        tmp_path, **{rough: np.array([0, 255, 0], np.uint8), metal: [0.25, 0.75, 0]}
-    )
+    _, roughness, metallic, lines = materials(tmp_path, **{rough: np.uint8([0, 255, 0]), metal: [0.25, 0.75, 0]})
     np.testing.assert_array_equal(roughness, [0, 1, 0])
     np.testing.assert_array_equal(metallic, [0.25, 0.75, 0])
     assert lines == ["no base_color in the file: 0.5 taken for all points"]

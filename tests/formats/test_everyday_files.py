@@ -28,13 +28,11 @@ UTM = np.array([500_000.123, 5_200_000.377, 120.0])
 
 
 def test_points_of_a_scene_lie_where_their_nodes_put_them_and_splats_are_refused(tmp_path):
-    builder, extension = GltfBuilder(), "KHR_gaussian_splatting"
-    points = builder.primitive(BALL.astype("f4"), None, mode=0)
+    builder, extension, ball = GltfBuilder(), "KHR_gaussian_splatting", BALL.astype("f4")
+    points = builder.primitive(ball, None, mode=0)
     builder.mesh(points, scale=[2, 2, 2])
     np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, 2 * BALL, atol=1e-6)
-    turned = builder.primitive(
-        BALL.astype("f4"), np.arange(3, dtype="u2"), mode=0, NORMAL=BALL.astype("f4"), material=0
-    )
+    turned = builder.primitive(ball, np.arange(3, dtype="u2"), mode=0, NORMAL=ball, material=0)
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*LINEAR, 1]}}]
     builder.mesh(turned, rotation=[0, 0, 0.5**0.5, 0.5**0.5])
     (cloud, _), turn = read(builder.write(tmp_path / "a.glb")), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
@@ -87,16 +85,17 @@ def test_a_header_of_bare_carriage_returns_ends_before_data_that_begins_with_a_l
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 
 
-def square_ply(kind: str, names, color) -> str:
+def square_ply(kind: str, names, color, corners=SQUARE) -> str:
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "".join(f"property {kind} {name}\n" for name in names)
-    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in SQUARE)
+    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in corners)
     faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
     return head + faces + rows + "3 0 1 2\n3 0 2 3\n"
 
 
 RGB, OBJ_FACE = ("red", "green", "blue"), "f 1 2 3 4\n"
 PACKED = GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]
+BYTES = square_ply("uchar", RGB, GREEN)
 CORNERS = [" ".join(map(str, corner)) for corner in SQUARE]
 COLORED_MESHES = {
     "ushort": ("a.ply", square_ply("ushort", RGB, [257 * c for c in GREEN])),
@@ -107,14 +106,8 @@ COLORED_MESHES = {
     "OFF with colours": ("a.off", "OFF\n4 1 0\n" + "".join(f"{c} 40 170 60\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OBJ, weights of the vertices": ("a.obj", "".join(f"v {c} 1 40 170 60\n" for c in CORNERS) + OBJ_FACE),
     "OFF, colours of faces": ("a.off", "OFF\n4 1 0\n" + "\n".join(CORNERS) + "\n4 0 1 2 3 40 170 60\n"),
-    "triangles and a polygon of four corners": (
-        "a.ply",
-        square_ply("uchar", RGB, GREEN).replace("face 2", "face 3") + "4 0 1 2 3\n",
-    ),
-    "strip": (
-        "a.ply",
-        square_ply("uchar", RGB, GREEN)[:-16].replace("face 2", "tristrips 1") + "5 0 1 3 2 -1\n",
-    ),
+    "triangles and a polygon of four corners": ("a.ply", BYTES.replace("face 2", "face 3") + "4 0 1 2 3\n"),
+    "strip": ("a.ply", BYTES[:-16].replace("face 2", "tristrips 1") + "5 0 1 3 2 -1\n"),
     "STOFF": ("a.off", "STCOFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255 0 1\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OBJ of bare CR": ("a.obj", ("".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE).replace("\n", "\r")),
     "OBJ with a byte order mark": ("a.obj", "\ufeff" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
@@ -138,6 +131,9 @@ def test_colours_of_a_scene_are_told_whatever_numbers_hold_them(tmp_path, kind, 
         builder.mesh(builder.primitive(positions, indices, mode=mode, COLOR_0=colors[: len(positions)]))
         cloud, _ = read(builder.write(tmp_path / "a.glb"), num_points=420)
         np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=3e-3)
+    builder, hidden = GltfBuilder(), np.column_stack([colors, np.where(PART, 0, white)]).astype(kind)
+    builder.mesh(builder.primitive(BALL.astype("f4"), None, mode=0, COLOR_0=hidden))
+    np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, BALL[~PART], atol=1e-6)
 
 
 PAINTED = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\n" + OBJ_FACE
@@ -165,14 +161,15 @@ def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
     return write_rows(folder, BALL, **dict(zip(RGB, colors.T, strict=True)), **more)
 
 
-@pytest.mark.parametrize(
-    ("factor", "stray", "white"), [(1, None, 255), (1, 65535, 255), (1, 256, 255), (16, None, 4095), (257, None, 65535)]
-)
+RANGES = (0.39, None, 100), (1, None, 255), (1, 65535, 255), (1, 256, 255), (16, None, 4095), (257, None, 65535)
+
+
+@pytest.mark.parametrize(("factor", "stray", "white"), RANGES)
 def test_the_range_of_colours_is_that_of_nearly_all_of_them(tmp_path, factor, stray, white):
     colors = np.tile(np.array([200, *GREEN[1:]]) * factor, (420, 1))
     if stray:
         colors[7] = stray
-    cloud, lines = read(colored_ball(tmp_path, colors))
+    cloud, lines = read(colored_ball(tmp_path, colors, "<f8" if factor < 1 else "<u2"))
     assert f"red green blue taken as sRGB in 0..{white}" in lines
     assert cloud.base_color[0, 0] == pytest.approx(0.578, abs=0.03)
     assert any("cut off there" in line for line in lines) == (stray is not None)
@@ -231,11 +228,13 @@ def test_a_line_says_that_the_picture_will_be_black(tmp_path):
 
 def test_meshes_at_map_coordinates_keep_their_shape(tmp_path):
     content = "".join("v {:.4f} {:.4f} {:.4f}\n".format(*(UTM + 0.2 * corner)) for corner in SQUARE) + OBJ_FACE
-    placed = place_cloud(write(tmp_path, "a.obj", content), num_points=3000, up="y")
-    np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=2e-3)
-    back = placed.cloud.positions.astype(np.float64) @ placed.rotation + placed.origin
-    assert np.abs(back - (UTM + [0.1, 0.1, 0])).max() < 0.1001
-    assert len(np.unique(placed.cloud.positions[:, 1])) > 2000
+    floats_in_text = square_ply("float", RGB, (0, 1, 0), UTM + 0.2 * SQUARE)
+    for name, text in (("a.obj", content), ("a.ply", floats_in_text)):
+        placed = place_cloud(write(tmp_path, name, text), num_points=3000, up="y")
+        np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=2e-3)
+        back = placed.cloud.positions.astype(np.float64) @ placed.rotation + placed.origin
+        assert np.abs(back - (UTM + [0.1, 0.1, 0])).max() < 0.1001
+        assert len(np.unique(placed.cloud.positions[:, 1])) > 2000
 
 
 def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
@@ -259,12 +258,9 @@ def test_a_stray_point_far_away_takes_no_digit_of_the_others(tmp_path):
         read(tmp_path / "a.npy")
 
 
-ROUNDED, LEFT_OUT = (
-    np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]]),
-    "normals of the file left out: ",
-)
+ROUNDED = np.column_stack([BALL[:, 0], np.round(3 * BALL[:, 1]) / 3, BALL[:, 2]])
 FLAT, SHORT = BALL * [50, 0.05, 50] + [0, 3e3, 0], r"only \d+ distinct values along y: the file's numbers are 0\.0002"
-PLATE = np.random.default_rng(0).uniform(-1, 1, (420, 3))
+PLATE, LEFT_OUT = np.random.default_rng(0).uniform(-1, 1, (420, 3)), "normals of the file left out: "
 ACROSS = spiral(420)[:, [1, 2, 0]] * [1, -1, 1]
 SAID = {  # positions and perhaps normals, what a line about them says
     "degrees": (BALL * [5e-5, 5e-5, 8] + [8.5, 47.1, 400], "x and y look like degrees"),
@@ -273,6 +269,7 @@ SAID = {  # positions and perhaps normals, what a line about them says
     "rounded": (ROUNDED, "only 7 distinct values along y, 414 along another axis: is it rounded?"),
     "short floats": (FLAT.astype("f4"), SHORT),
     "short floats on a map": ((200 * BALL + UTM).astype("f4"), r"only \d+ distinct values along y: .* are 0\.5 apart"),
+    "doubles that were short": ((20 * BALL + UTM).astype("f4").astype(float), r"only \d+ distinct .* are 0\.5 apart"),
     "short floats of a large ball": ((BALL + [0, 3e3, 0]).astype("f4"), None),
     "thin plate": (PLATE * [1, 1, 0.02], "the points lie in a plate 0.[34]\\d spacings thick: if both sides"),
     "thicker plate": (PLATE * [1, 1, 0.2], None),
@@ -308,14 +305,16 @@ def test_a_mesh_far_away_whose_file_has_six_digits_is_said_to_be_rounded(tmp_pat
         assert any(re.match(r"only 3 distinct values along y, 4\d\d along", line) for line in lines) == rounded
 
 
-def test_places_of_a_grid_without_a_height_are_left_out_and_heights_that_reach_so_low_are_not(tmp_path):
-    fifth = np.where(np.arange(420) % 5 == 0, -9999, BALL[:, 2])
-    low = np.append(-9999, 2e4 * BALL[1:, 2])
-    for size, z, left in ((1, fifth, 336), (2e4, low, 420)):
-        np.save(tmp_path / "a.npy", np.column_stack([size * BALL[:, :2], z]))
+def test_places_of_a_grid_without_data_are_left_out_and_heights_that_reach_so_low_are_not(tmp_path):
+    fifth = (np.arange(420) % 5 == 0)[:, None] & [False, False, True]
+    tables = {f"height is {z}": (np.where(fifth, z, BALL), 336) for z in (-9999, -32768)}
+    tables["place is 0 0 0"] = np.where(fifth[:, 2:], 0, BALL), 336
+    tables["height is low"] = np.vstack([[0, 0, -9999], 2e4 * BALL[1:]]), 420
+    for what, (positions, left) in tables.items():
+        np.save(tmp_path / "a.npy", positions)
         cloud, lines = read(tmp_path / "a.npy")
         assert len(cloud.positions) == left
-        assert ("84 points left out: their height is -9999, no data" in lines) == (left == 336)
+        assert (f"84 points left out: their {what}, no data" in lines) == (left == 336)
 
 
 @pytest.mark.parametrize("text", [True, False])
@@ -421,6 +420,11 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
         cloud, lines = read(write(tmp_path, name, text), num_points=100)
         assert np.isfinite(cloud.positions).all()
         assert "1 face left out for a vertex that is NaN or infinity" in lines
+    hidden = "COFF\n4 2 0\n" + "".join(f"{c} 1 1 1 {i // 3}\n" for i, c in enumerate(CORNERS)) + "3 0 1 2\n3 0 2 3\n"
+    cloud, lines = read(write(tmp_path, "a.off", hidden), num_points=100)
+    assert (cloud.positions[:, 1] >= cloud.positions[:, 0]).all()
+    assert "1 face left out for the alpha of their vertices, near 0" in lines
+    assert not any("alpha" in line for line in read(write(tmp_path, "a.off", hidden.replace(" 1\n", " 0\n")))[1])
 
 
 @pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", r"Maps\COLORS.png"])

@@ -75,9 +75,7 @@ def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):
     cloud = read_cloud(write(tmp_path, "a.ply", content))
     np.testing.assert_allclose(cloud.positions, BALL, atol=1.1e-3)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (420, 3)), atol=2e-3)
-    ranges = b"".join(
-        b"property float %s_%s\n" % (end, axis) for end in (b"min", b"max") for axis in (b"r", b"g", b"b")
-    )
+    ranges = b"".join(b"property float %s_%s\n" % (end, x) for end in (b"min", b"max") for x in (b"r", b"g", b"b"))
     boxes = np.tile(np.repeat(np.float32([-1, 1, 0.25, 0.75]), 3), 2).tobytes()  # of two chunks: places, then colours
     content = content.replace(b"element vertex", ranges + b"element vertex")
     content = content.replace(np.tile(np.repeat(np.float32([-1, 1]), 3), 2).tobytes(), boxes)
@@ -132,9 +130,8 @@ def test_three_reads_places_shapes_colours_and_opacities_as_they_were_written(re
     np.testing.assert_allclose(found["position"].reshape(-1, 3), wanted.position, atol=1e-6 + 1e-6 * coarser)
     largest = np.abs(shape).max()
     np.testing.assert_allclose(found["covariance"].reshape(-1, 6), shape, atol=(1e-5 + 0.07 * coarser) * largest)
-    np.testing.assert_allclose(
-        found["color"].reshape(-1, 4) / 255, np.clip(color, 0, 1), atol=(1 + 0.6 * coarser) / 255
-    )
+    colors, step = found["color"].reshape(-1, 4) / 255, (1 + 0.6 * coarser) / 255
+    np.testing.assert_allclose(colors, np.clip(color, 0, 1), atol=step)
     words = found["sphericalHarmonics1"].astype(np.uint32)[:, None] >> np.array([0, 8, 16, 24]) & 255
     rest = (words.reshape(len(color), -1)[:, :9].astype(float) - 128) / 128
     np.testing.assert_allclose(

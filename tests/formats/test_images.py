@@ -21,9 +21,8 @@ def shaded_frames(count: int) -> list[np.ndarray]:
 
 
 def test_eight_bit_values_round_to_the_nearest_level_and_a_png_holds_them(tmp_path):
-    np.testing.assert_array_equal(
-        to_uint8(np.array([-0.1, 0.0, 0.4999 / 255, 0.5, 1.0, 1.2])), [0, 0, 0, 128, 255, 255]
-    )
+    levels = to_uint8(np.array([-0.1, 0.0, 0.4999 / 255, 0.5, 1.0, 1.2]))
+    np.testing.assert_array_equal(levels, [0, 0, 0, 128, 255, 255])
     np.testing.assert_array_equal(to_uint8(np.arange(256) / 255), np.arange(256))
     for shape in ((5, 7, 3), (5, 7)):
         image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

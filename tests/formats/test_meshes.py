@@ -55,9 +55,8 @@ def test_a_ply_has_its_textures_by_face_or_by_vertex(tmp_path, form):
     for i in (0, 1):
         Image.fromarray(np.roll(CHECKER, i, axis=0)[..., :3].astype(np.uint8)).save(tmp_path / f"the image {i}.png")
     texture = "comment TextureFile {}\n".format
-    names = {"two images": ("the image 0.png", "the image 1.png"), "no image": ("gone.png",)}.get(
-        form, ["the image 0.png"]
-    )
+    names = {"two images": ("the image 0.png", "the image 1.png"), "no image": ("gone.png",)}
+    names = names.get(form, ("the image 0.png",))
     flat, of_vertices = [(x, y, 0, x, y) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], form == "vertices"
     head = "".join(["ply\nformat ascii 1.0\n", *map(texture, names), "element vertex 4\n"])
     head += "".join(f"property float {name}\n" for name in ("x", "y", "z", *("st" if of_vertices else "")))
@@ -83,9 +82,8 @@ def test_what_is_missing_of_a_mesh_is_said(tmp_path):
         (tmp_path / "a.stl").write_text(f"solid a\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n{end}")
         assert (load_mesh(tmp_path / "a.stl").notes != ()) == said
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "roughness"))
-    head = (
-        f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\nproperty list uchar int vertex_index\n"
-    )
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}"
+    head += "element face 1\nproperty list uchar int vertex_index\n"
     (tmp_path / "a.ply").write_text(f"{head}end_header\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n")
     assert "roughness and metallic of vertices" in load_mesh(tmp_path / "a.ply").ignored
 
@@ -165,9 +163,7 @@ LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ig
 
 
 @pytest.mark.parametrize(("mtl", "expected", "ignored"), LOOKS)
-def test_an_opaque_material_has_its_colour_or_texture_and_the_roughness_of_pr_or_of_the_exponent(
-    tmp_path, mtl, expected, ignored
-):
+def test_an_opaque_material_has_its_colour_or_texture_and_its_roughness(tmp_path, mtl, expected, ignored):
     asset = load_mesh(write_obj(tmp_path, TEXTURED, f"newmtl paint\n{mtl}\n"))
     look, (color, roughness, metallic, wrap) = asset.parts[0].material, expected
     np.testing.assert_allclose(look.base_color, color, rtol=0, atol=1e-6 if color.ndim > 1 else 0)

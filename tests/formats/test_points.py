@@ -85,8 +85,12 @@ TIMED = [(17.5 + i / 1e3 + (i % 3) / 1e4, *row) for i, row in enumerate(ROWS)]
 LABELED = [(*row, i % 40) for i, row in enumerate(ROWS)]
 PARAVIEW = [(*GREEN, *row[:3]) for row in ROWS]
 PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for row in ROWS]
+PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
+WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
+OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
+PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ascii\n"
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
-BALL_AND_TWO = [(*point, 0, 0) for point in POINTS]
+GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
@@ -129,6 +133,17 @@ TEXTS = {
     "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
     **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
     "grey: decimal commas in quotes": ("a.csv", QUOTED),
+    "a column of words": ("a.csv", "x,y,z,r,g,b,label\n" + table(",", ",chair")),
+    "words before the numbers": ("a.csv", WORDY),
+    "fields that are not known": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "NA,1,1,1,2,3\nNULL,n/a,1,1,2,3\n"),
+    "bars": ("a.txt", "x|y|z|r|g|b\n" + table("|")),
+    "a table of R": ("a.txt", '"x" "y" "z" "r" "g" "b"\n' + table(" ", columns=INDEXED)),
+    "files one behind the other": ("a.csv", "x,y,z,r,g,b\n" + table(",").replace("\n", "\nx,y,z,r,g,b\n", 200)),
+    "UTF-16 without its mark": ("a.csv", ("x,y,z,r,g,b\n" + table(",")).encode("utf-16-le")),
+    "names that differ in a word": ("a.csv", "local_x,local_y,local_z,r_8bit,g_8bit,b_8bit\n" + table(",")),
+    "row and column in a scanner's picture": ("a.xyz", table(" ", columns=PICTURED)),
+    "a row of the largest numbers": ("a.xyz", table(" ") + 3 * "3.40282e+38 " + "1 2 3\n"),
+    "ASCII PCD, packed colours as whole numbers of a float": ("a.pcd", PCL + table(" ", columns=OPAQUE)),
     "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
     "grey: UTF-16 OBJ": ("a.obj", POINT_LINES.encode("utf-16")),
     "grey: OFF with a byte order mark": ("a.off", "\ufeffOFF\n420 0 0\n" + table(" ", columns=POINTS)),
@@ -152,11 +167,13 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     assert lines[0].startswith("an array of 20 x 21 x 3 taken as one cloud; of a batch")
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
-    x, y, z = BALL.T
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
     ignored = {"arr_3": np.arange(420), "arr_4": np.zeros((420, 9)), "arr_5": 3 * BALL}
     tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
-    for arrays in ({"arr_0": ROWS}, tables, {"x": x, "y": y, "z": z, "rgb": opaque}, {"pc": np.array(ROWS)}):
+    turned = {"vertices": BALL.T, "vertex_colors": opaque[:, :3].T}
+    maps = {"pts3d": BALL.reshape(20, 21, 3), "point_rgb": opaque.reshape(20, 21, 4)}
+    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque}
+    for arrays in ({"arr_0": ROWS}, tables, separate, {"pc": np.array(ROWS)}, turned, maps):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
@@ -167,7 +184,7 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
         ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
         ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
-        ("a.csv", "x,y,z,depth,label\n" + table(",", columns=BALL_AND_TWO), "columns that are not used: depth, label"),
+        ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
     ],
 )
@@ -212,10 +229,8 @@ VALUES = {  # of columns
     "alpha": np.full(420, 255),
 }
 UNNAMED = {  # columns, their names where these differ
-    **dict.fromkeys(
-        ("intensity", "r g b", "nx ny nz", "intensity, r g b", "r g b, alpha", "r g b, roughness, metallic")
-    ),
-    **dict.fromkeys(("r g b, nx ny nz", "nx ny nz, r g b")),
+    **dict.fromkeys(("intensity", "r g b", "nx ny nz", "intensity, r g b", "r g b, alpha")),
+    **dict.fromkeys(("r g b, nx ny nz", "nx ny nz, r g b", "r g b, roughness, metallic")),
     "unit colours": "r g b",
     "whole intensity, r g b": "intensity r g b",
     "r g b, label": "r g b scalar",
@@ -297,16 +312,16 @@ def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z
     np.testing.assert_allclose(placed.cloud.base_color, SRGB[WHOLE.levels], atol=1e-4)
 
 
-def test_a_scan_without_colours_shows_its_intensity(tmp_path):
-    as_scan(tmp_path / "a.las", WHOLE, 6)
-    assert np.ptp(read_cloud(tmp_path / "a.las").base_color) > 0.9
+def test_a_scan_without_colours_shows_its_intensity_and_what_its_extra_bytes_say(tmp_path):
+    as_scan(tmp_path / "a.las", WHOLE, 6, Roughness=WHOLE.roughness)
+    cloud = read_cloud(tmp_path / "a.las")
+    assert np.ptp(cloud.base_color) > 0.9
+    np.testing.assert_allclose(cloud.roughness, WHOLE.roughness)
 
 
 def test_the_lowest_intensity_is_no_missing_colour(tmp_path):
     lowest = np.random.default_rng(0).random(420) < 0.3
-    rows = [
-        (*point, 0 if low else 50 + i % 40) for i, (point, low) in enumerate(zip(BALL.tolist(), lowest, strict=True))
-    ]
+    rows = [(*p, 0 if low else 50 + i % 40) for i, (p, low) in enumerate(zip(BALL.tolist(), lowest, strict=True))]
     cloud, lines = read(write(tmp_path, "a.xyz", table(" ", columns=rows)))
     np.testing.assert_array_equal(cloud.base_color[:, 0] < 0.01, lowest)
     assert not any("no colour (0 0 0)" in line for line in lines)
@@ -391,11 +406,7 @@ REFUSED = [
     ("a.ply", None, "no such file"),
     ("a.xyz", "", "the file is empty"),
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
-    (
-        "points3D.txt",
-        "# 3D point list with one line of data per point:\n",
-        "COLMAP's points, which is not read: .* .colmap model_converter",
-    ),
+    ("a.txt", "# 3D point list with one line\n", "COLMAP's points, which is not read: .* .colmap model_converter"),
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
@@ -418,11 +429,7 @@ REFUSED = [
     ("a.ply", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0, .* Blender"),
     ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
     ("a.usdz", b"PK\3\4", r"USD \(package\), which is not read: convert it to .glb"),
-    (
-        "a.fbx",
-        b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0",
-        "FBX of version 7400, which is not read: convert it to .glb",
-    ),
+    ("a.fbx", b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0", "FBX of version 7400, which is not read: convert it to"),
     ("a.dae", '<?xml version="1.0"?>\n<COLLADA xmlns="x" version="1.4.1">', "COLLADA of version 1.4.1, "),
     ("a.pkl", b"\x80", "a .pkl file, which is not read: save its points"),
     ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
@@ -441,17 +448,15 @@ REFUSED = [
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
+    ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", "line 2: expected 3 numbers, found '1,2m,3'"),
+    ("a.csv", "x,y,z\n0,5,1,5,2,5\n", "names 3 columns .* above 6 .*; decimal commas need another separator"),
     ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F"), "disagree"),
     ("a.pcd", PCD.replace(b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1"), "bytes; expected at most"),
     ("a.pcd", PCD.replace(b"POINTS 12", b"POINTS -4"), "-4"),
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
     ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
-    (
-        "a.npy",
-        b"\x93NUMPY\x02\x00" + (9001).to_bytes(4, "little") + b"~" * 9000 + b"1",
-        "a broken, truncated or pickled",
-    ),
+    ("a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 9001) + b"~" * 9000 + b"1", "a broken, truncated or pickled"),
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
     ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),

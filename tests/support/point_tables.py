@@ -103,7 +103,7 @@ def as_numpy(path, table):
         np.save(path, rows)
 
 
-def as_scan(path, table, point_format: int = 7):
+def as_scan(path, table, point_format: int = 7, **extra):
     laspy = pytest.importorskip("laspy")
     scan = laspy.LasData(laspy.LasHeader(point_format=point_format, version="1.4"))
     scan.header.scales = [0.125] * 3
@@ -111,6 +111,9 @@ def as_scan(path, table, point_format: int = 7):
     scan.intensity = 100 * np.arange(12)
     if point_format == 7:
         scan.red, scan.green, scan.blue = (257 * table.levels.T).astype(np.uint16)
+    for name, values in extra.items():
+        scan.add_extra_dim(laspy.ExtraBytesParams(name, values.dtype))
+        scan[name] = values
     scan.write(path)
 
 
