@@ -48,9 +48,9 @@ def test_file(name: str) -> str:
 def read_table(path: Path = TABLE) -> tuple[Mutant, ...]:
     """The mutants of tests/mutants.toml."""
     return tuple(
-        Mutant(tests=tuple(map(test_file, module["tests"])), file=module["file"], **fault)
+        Mutant(name=name, file=module["file"], old=old, new=new, tests=tuple(map(test_file, module["tests"])))
         for module in tomllib.loads(path.read_text())["module"]
-        for fault in module["fault"]
+        for name, old, new in module["fault"]
     )
 
 
