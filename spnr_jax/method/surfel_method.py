@@ -27,7 +27,6 @@ from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
 from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
-from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.lighting import room_light
 
 BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
@@ -127,7 +126,7 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
 
 @partial(CachedProgram, returns=(SurfelScene, Surfels), options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
-    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()), CONSTANTS)
+    return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()))
 
 
 _densify = CachedProgram(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)

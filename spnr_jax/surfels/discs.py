@@ -25,45 +25,43 @@ from spnr_jax.kernels.numerics import (
     sum_products,
     unit,
 )
-from spnr_jax.surfels.layers import Constants, Neighborhood, project_on
+from spnr_jax.surfels.layers import CONSTANTS, Neighborhood, project_on
 
 NUM_RIM_DIRECTIONS = 16  # in which the rim of a layer is searched
 CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # columns of a color edge's sums: moments of the colors
 RIM_ANGLES = 2 * np.pi / NUM_RIM_DIRECTIONS * np.arange(NUM_RIM_DIRECTIONS)
 
 
-def measure_raw_spacing(hood: Neighborhood, const: Constants) -> Float[Array, " block"]:
+def measure_raw_spacing(hood: Neighborhood) -> Float[Array, " block"]:
     """Raw spacing: from the area of the disc that holds 6 neighbors on any layer; in units of the box."""
-    count = jnp.minimum(const.raw_neighbors, jnp.sum(hood.real, axis=0) - 1)
+    count = jnp.minimum(CONSTANTS.raw_neighbors, jnp.sum(hood.real, axis=0) - 1)
     chosen = jnp.arange(len(hood.real), dtype=count.dtype)[:, None] == count[None]
     distance = safe_sqrt(jnp.sum(jnp.where(chosen, hood.squared, 0), axis=0))
     several = count > 0  # a single point represents a tenth of the box
-    spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, const.least_spacing)
-    return jnp.where(several, spacing, const.single_spacing)
+    spacing = larger(jnp.sqrt(jnp.pi / jnp.where(several, count, 1)) * distance, CONSTANTS.least_spacing)
+    return jnp.where(several, spacing, CONSTANTS.single_spacing)
 
 
 def measure_layer_spacing(
-    hood: Neighborhood, membership: Float[Array, "k block"], raw: Float[Array, " block"], const: Constants
+    hood: Neighborhood, membership: Float[Array, "k block"], raw: Float[Array, " block"]
 ) -> Float[Array, " block"]:
     """Spacing from the area of the disc that holds 3 neighbors (by weight) on the same layer; in units of the box."""
     others = len(membership) - 1
     summed = jnp.matmul(jnp.tril(jnp.ones((others, others), membership.dtype)), membership[1:], precision="highest")
-    wanted = jnp.minimum(const.disc_weight, jnp.maximum(const.disc_share * summed[-1], 0.5))
+    wanted = jnp.minimum(CONSTANTS.disc_weight, jnp.maximum(CONSTANTS.disc_share * summed[-1], 0.5))
     count = jnp.sum(hood.real, axis=0) - 1
     last = jnp.minimum(sum_first((summed < wanted[None]).astype(count.dtype)), jnp.maximum(count - 1, 0))
     chosen = jnp.arange(others, dtype=count.dtype)[:, None] == last[None]
     weight, squared = sum_first(jnp.where(chosen, summed, 0)), sum_first(jnp.where(chosen, hood.squared[1:], 0))
     spacing = jnp.sqrt(jnp.pi / larger(weight, 1)) * safe_sqrt(squared)
-    low, high = const.spacing_bounds
+    low, high = CONSTANTS.spacing_bounds
     return jnp.where(count > 0, clamp(spacing, low * raw, high * raw), raw)
 
 
-def smooth_spacing(
-    membership: Float[Array, "k block"], spacings: Float[Array, "k block"], const: Constants
-) -> Float[Array, " block"]:
+def smooth_spacing(membership: Float[Array, "k block"], spacings: Float[Array, "k block"]) -> Float[Array, " block"]:
     """Geometric mean of the spacing over the 9 nearest neighbors on the same layer."""
-    weight, near = membership[: const.averaged_neighbors], spacings[: const.averaged_neighbors]
-    return jnp.exp(sum_first(weight * jnp.log(larger(near, const.least_spacing))) / sum_first(weight))
+    weight, near = membership[: CONSTANTS.averaged_neighbors], spacings[: CONSTANTS.averaged_neighbors]
+    return jnp.exp(sum_first(weight * jnp.log(larger(near, CONSTANTS.least_spacing))) / sum_first(weight))
 
 
 def average_rows(
@@ -91,9 +89,7 @@ def find_farthest(uv: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:
     return jnp.concatenate(jax.lax.map(look, (jnp.cos(turn), jnp.sin(turn))))
 
 
-def bridge_gaps(
-    uv: Float[Array, "k 2 block"], membership: Float[Array, "k block"], const: Constants
-) -> Float[Array, " block"]:
+def bridge_gaps(uv: Float[Array, "k 2 block"], membership: Float[Array, "k block"]) -> Float[Array, " block"]:
     """Factor by which a disc is enlarged beside gaps, so that the discs around a gap cover its middle.
 
     A gap is an empty circle through the point with other points all around it; its center is a vertex of the Voronoi
@@ -102,13 +98,13 @@ def bridge_gaps(
     inversion p -> 2 p / |p|^2, the distance of the farthest point in the direction is the curvature of that circle.
     """
     half = (uv[:, 0] ** 2 + uv[:, 1] ** 2) / 2
-    other = (membership > 0.5) & (half > const.duplicate_distance)
+    other = (membership > 0.5) & (half > CONSTANTS.duplicate_distance)
     inverse = jnp.where(other, 1 / jnp.where(other, half, 1), 0)
     curved = find_farthest(uv * inverse[:, None])
-    vertex = (curved > 1 / const.widest_gap) & (curved <= jnp.roll(curved, 1, axis=0))
+    vertex = (curved > 1 / CONSTANTS.widest_gap) & (curved <= jnp.roll(curved, 1, axis=0))
     vertex = vertex & (curved <= jnp.roll(curved, -1, axis=0))
-    least = smallest(jnp.where(vertex, curved, 1 / const.gap_cover))
-    return larger(1 / (least * const.gap_cover), 1)
+    least = smallest(jnp.where(vertex, curved, 1 / CONSTANTS.gap_cover))
+    return larger(1 / (least * CONSTANTS.gap_cover), 1)
 
 
 class ClipLines(NamedTuple):
@@ -126,21 +122,20 @@ def find_clip_lines(
     one_sided: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
     neighbors_one_sided: Float[Array, "k block"],
-    const: Constants,
 ) -> ClipLines:
     """At a sharp edge, the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
     across, up, facing = (project_on(normals, axis) for axis in axes)
     flat = safe_sqrt(across**2 + up**2)
-    clip_lines = (facing < const.edge_cosine) & (flat > const.edge_sine) & (hood.real > 0)
+    clip_lines = (facing < CONSTANTS.edge_cosine) & (flat > CONSTANTS.edge_sine) & (hood.real > 0)
     clip_lines = (
         clip_lines
         & (neighbors_one_sided > 0.5)
         & (one_sided > 0.5)[None]
-        & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
+        & (hood.squared < (CONSTANTS.rim_radius * spacing[None]) ** 2)
     )
     inverse = jnp.where(clip_lines, 1 / jnp.where(clip_lines, flat, 1), 0)
     line = jnp.sum(normals * hood.offset, axis=1) / spacing[None] * inverse
-    distance = jnp.where(clip_lines & (line > 0), line + const.cut_margin, jnp.inf)
+    distance = jnp.where(clip_lines & (line > 0), line + CONSTANTS.cut_margin, jnp.inf)
     return ClipLines(*jax.lax.optimization_barrier((distance, across * inverse, up * inverse)))
 
 
@@ -148,7 +143,6 @@ def find_rims(
     ends: Float[Array, "16 block"],
     clip_lines: ClipLines,
     axes: Float[Array, "3 3 block"],
-    const: Constants,
 ) -> tuple[Float[Array, "3 block"], Float[Array, "4 block"]]:
     """The direction in which the layer ends first, and the distances of the ends, in the form of `Surfels`.
 
@@ -157,7 +151,7 @@ def find_rims(
     """
     constant = jax.lax.stop_gradient((clip_lines.distance, ends))
     nearest, soonest = jnp.min(constant[0], axis=0), jnp.argmin(constant[1], axis=0)
-    cut = nearest < jnp.min(constant[1], axis=0) + const.rim_margin
+    cut = nearest < jnp.min(constant[1], axis=0) + CONSTANTS.rim_margin
     first = (constant[0] <= nearest[None]) & cut[None]
     turn = jnp.asarray(RIM_ANGLES, ends.dtype)
     direction = [
@@ -168,7 +162,7 @@ def find_rims(
 
     def find_end(direction: tuple[Array, Array]) -> Array:
         right, high = direction
-        cut_cosine = clip_lines.across * right[None] + clip_lines.up * high[None] > const.cut_cosine
+        cut_cosine = clip_lines.across * right[None] + clip_lines.up * high[None] > CONSTANTS.cut_cosine
         line = smallest(jnp.where(cut_cosine, clip_lines.distance, jnp.inf))
         angle = jnp.arctan2(*jax.lax.stop_gradient((high, right)))
         step = jnp.round(angle / (2 * jnp.pi) * NUM_RIM_DIRECTIONS).astype(jnp.int32) % NUM_RIM_DIRECTIONS
@@ -176,7 +170,9 @@ def find_rims(
         return jnp.where(line < jnp.inf, jnp.where(line < jnp.inf, line, 0), end)
 
     quarters = jnp.stack([right, -right, -high, high]), jnp.stack([high, -high, right, -right])
-    return right[None] * axes[0] + high[None] * axes[1], smaller(jax.lax.map(find_end, quarters), const.largest_radius)
+    return right[None] * axes[0] + high[None] * axes[1], smaller(
+        jax.lax.map(find_end, quarters), CONSTANTS.largest_radius
+    )
 
 
 def find_color_edge(
@@ -185,7 +181,6 @@ def find_color_edge(
     spacing: Float[Array, " block"],
     axes: Float[Array, "3 3 block"],
     colors: Float[Array, "k 3 block"],
-    const: Constants,
 ) -> dict[str, Array]:
     """The fields `color_edge` (4, block) and `color_jump` (3, block): a straight edge between two colors, if any.
 
@@ -193,7 +188,7 @@ def find_color_edge(
     neighbors have the other color is constant for gradients.
     """
     squared = uv[:, 0] ** 2 + uv[:, 1] ** 2
-    weight = membership * jnp.exp(-0.5 / const.color_edge_sigma**2 * squared)
+    weight = membership * jnp.exp(-0.5 / CONSTANTS.color_edge_sigma**2 * squared)
     weight = jax.lax.optimization_barrier(weight / sum_first(weight)[None])
     roots, change = safe_sqrt(colors), colors - colors[:1]
     roots = roots - roots[:1]
@@ -203,8 +198,8 @@ def find_color_edge(
     groups = jnp.stack([weight * ~beyond, weight * beyond], axis=1)
     spread = jnp.sum(roots**2, axis=1)[:, None]
     own, other = sum_products(groups, jnp.concatenate([plane, products, change, roots, spread], axis=1))
-    direction, distance, wrong = _find_line(uv, weight, beyond, own, other, const)
-    confidence = _measure_confidence(own, other, const) * _ramp(wrong, const.wrong_side)
+    direction, distance, wrong = _find_line(uv, weight, beyond, own, other)
+    confidence = _measure_confidence(own, other) * _ramp(wrong, CONSTANTS.wrong_side)
     edge = [direction[0][None] * axes[0] + direction[1][None] * axes[1], (distance * spacing)[None]]
     jump = confidence[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
     return {"color_edge": jnp.concatenate(edge), "color_jump": jump}
@@ -223,9 +218,7 @@ def _split_colors(weight: Float[Array, "k block"], change: Float[Array, "k 3 blo
     return project_on(change, axis) > 0.5 * dot(axis, axis)[None]
 
 
-def _measure_confidence(
-    own: Float[Array, "sums block"], other: Float[Array, "sums block"], const: Constants
-) -> Float[Array, " block"]:
+def _measure_confidence(own: Float[Array, "sums block"], other: Float[Array, "sums block"]) -> Float[Array, " block"]:
     """Confidence that there are two colors, from the moments of square roots of linear colors."""
     apart = _mean(other, ROOTS) - _mean(own, ROOTS)
     whole = own + other
@@ -233,9 +226,9 @@ def _measure_confidence(
     between = own[0] * other[0] * dot(apart, apart) / variance
     contrast = largest(jnp.abs(apart))
     return (
-        _ramp(other[0], const.other_color_share)
-        * _ramp(contrast, const.contrast)
-        * _ramp(between, const.parted_variance)
+        _ramp(other[0], CONSTANTS.other_color_share)
+        * _ramp(contrast, CONSTANTS.contrast)
+        * _ramp(between, CONSTANTS.parted_variance)
     )
 
 
@@ -245,7 +238,6 @@ def _find_line(
     beyond: Bool[Array, "k block"],
     own: Float[Array, "sums block"],
     other: Float[Array, "sums block"],
-    const: Constants,
 ) -> tuple[Float[Array, "2 block"], Float[Array, " block"], Float[Array, " block"]]:
     """Unit direction across the line, distance of the line along it, and the share of neighbors on the wrong side.
 
@@ -257,9 +249,9 @@ def _find_line(
     normal = jnp.stack(
         [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
     )
-    direction = unit(_solve_plane(normal, const.color_edge_ridge)[:, 0])
+    direction = unit(_solve_plane(normal, CONSTANTS.color_edge_ridge)[:, 0])
     height = jax.lax.optimization_barrier(uv[:, 0] * direction[0][None] + uv[:, 1] * direction[1][None])
-    there = weight > const.color_edge_least_weight
+    there = weight > CONSTANTS.color_edge_least_weight
     last = largest(jnp.where(there & ~beyond, height, 0))  # the point itself lies at 0
     first = smallest(jnp.where(there & beyond, height, jnp.inf))
     some = first < jnp.inf

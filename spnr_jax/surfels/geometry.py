@@ -14,8 +14,8 @@ Points are processed in blocks, one after the other, so that a million fit into 
 from arrays of all points, which are (columns, points) in this file.
 
 Gradients flow from positions, normals and colors through normals, spacings, ends of discs and colors.  Discrete choices
-are const without a gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a
-disc or has another color, sides and flips of normals, and visibility from each direction.
+have no gradient: the neighbors, the plane that the fit of a layer starts from, the neighbor that ends a disc or has
+another color, sides and flips of normals, and visibility from each direction.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ from spnr_jax.kernels.numerics import (
 )
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
 from spnr_jax.surfels import discs, layers, sides
-from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS, Constants, Layer, Neighborhood, project_on
+from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS, Layer, Neighborhood, project_on
 from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 # --- neighbors, on the host -------------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ class PointColumns(NamedTuple):
     color: Float[Array, "3 points"]
 
 
-def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], const: Constants = CONSTANTS) -> Surfels:
+def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> Surfels:
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
     One surfel per point, in the same order; `mask` is False for padding.
@@ -173,11 +173,11 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"], cons
         position=columns(cloud.positions),
         color=columns(cloud.base_color),
     )
-    raw_spacing, layer = find_layers(points, normals, oriented=True, split_by_color=normals is None, const=const)
-    visibility = estimate_visibility(points, layer.normal, raw_spacing, const)
-    normal, one_sided = orient_layers(points, raw_spacing, layer, visibility, const)
-    random = jnp.asarray(measure_evenness(cloud, neighbors)) < const.even
-    fields = describe_discs(points, raw_spacing, layer, normal, one_sided, visibility, random, const)
+    raw_spacing, layer = find_layers(points, normals, oriented=True, split_by_color=normals is None)
+    visibility = estimate_visibility(points, layer.normal, raw_spacing)
+    normal, one_sided = orient_layers(points, raw_spacing, layer, visibility)
+    random = jnp.asarray(measure_evenness(cloud, neighbors)) < CONSTANTS.even
+    fields = describe_discs(points, raw_spacing, layer, normal, one_sided, visibility, random)
     known = jnp.ones_like(raw_spacing) if cloud.materials_known is None else columns(cloud.materials_known)
     learned = jnp.zeros_like(raw_spacing) if cloud.learned is None else columns(cloud.learned)
     fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic)}
@@ -234,7 +234,6 @@ def map_blocks(
     work: Callable[..., Any],
     points: PointColumns,
     columns: Float[Array, "columns points"],
-    const: Constants,
     *own: Any,
 ) -> Any:
     """The results of `work` for all blocks of points, concatenated.
@@ -244,7 +243,7 @@ def map_blocks(
     the inputs of a block are kept, and the block is computed again.
     """
     count = points.mask.shape[0]
-    size = min(const.block_size, count)
+    size = min(CONSTANTS.block_size, count)
     table = jnp.concatenate([points.position, columns])
     neighbors, packed = points.neighbors, _pack((points.position, own))
     forms: list[Any] = []
@@ -301,7 +300,6 @@ def find_layers(
     *,
     oriented: bool,
     split_by_color: bool,
-    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, " points"], Layer]:
     """Raw spacings, and layers from unit normals (0 where there is none).
 
@@ -311,26 +309,26 @@ def find_layers(
     roots = safe_sqrt(points.color)
 
     def fit(hood: Neighborhood, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
-        raw_spacing = discs.measure_raw_spacing(hood, const)
-        weight = layers.weigh_distance(hood, raw_spacing, const)
-        first, fixed = layers.init_normals(hood, raw_spacing, *own, const=const)
+        raw_spacing = discs.measure_raw_spacing(hood)
+        weight = layers.weigh_distance(hood, raw_spacing)
+        first, fixed = layers.init_normals(hood, raw_spacing, *own)
         if oriented and own:
             weight = weight * jnp.where(fixed[None], clamp(0.5 + project_on(hood.columns[:, 3:], first), 0, 1), 1)
-        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3], const) if split_by_color else None
-        return raw_spacing, *layers.fit_layers(hood, raw_spacing, first, weight, fixed, color_distance, const)
+        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3]) if split_by_color else None
+        return raw_spacing, *layers.fit_layers(hood, raw_spacing, first, weight, fixed, color_distance)
 
     given = () if normals is None else (normals,)
-    raw_spacing, layer, split = map_blocks(fit, points, jnp.concatenate([roots, *given]), const, *given)
+    raw_spacing, layer, split = map_blocks(fit, points, jnp.concatenate([roots, *given]), *given)
     if split is None:
         return raw_spacing, layer
 
     def keep_agreed(hood: Neighborhood, layer: Layer, split: layers.SplitLayer) -> Layer:
-        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3], const)
-        return layers.keep_agreed_splits(hood, layer, split, color_distance, hood.columns[:, 3], const)
+        color_distance = layers.measure_color_distance(hood, hood.columns[:, :3])
+        return layers.keep_agreed_splits(hood, layer, split, color_distance, hood.columns[:, 3])
 
     table = jnp.concatenate([roots, split.certain[None].astype(raw_spacing.dtype)])
     layer = jax.lax.cond(
-        jnp.any(split.certain), lambda: map_blocks(keep_agreed, points, table, const, layer, split), lambda: layer
+        jnp.any(split.certain), lambda: map_blocks(keep_agreed, points, table, layer, split), lambda: layer
     )
     return raw_spacing, layer
 
@@ -339,11 +337,10 @@ def estimate_visibility(
     points: PointColumns,
     normal: Float[Array, "3 points"],
     spacing: Float[Array, " points"],
-    const: Constants = CONSTANTS,
 ) -> Float[Array, "64 points"]:
     """Visibility of each point from each of 64 directions."""
     middle, grid = jnp.asarray(median(spacing, points.mask)), choose_grid(points.mask.shape[0])
-    low, high = const.visibility_spacing_bounds
+    low, high = CONSTANTS.visibility_spacing_bounds
     bounded = jnp.clip(spacing, low * middle, high * middle)
     return compute_visibility(points.position, normal, bounded, points.mask, choose_cell(middle, grid), grid=grid)
 
@@ -353,7 +350,6 @@ def orient_layers(
     raw_spacing: Float[Array, " points"],
     layer: Layer,
     visibility: Float[Array, "64 points"],
-    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Normals that point outward, and the confidence in that (`one_sided`)."""
     turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw_spacing, layer))
@@ -364,15 +360,15 @@ def orient_layers(
     def vote(votes: Array, first: Array) -> tuple[Array, None]:
         def combine(hood: Neighborhood, raw_spacing: Array, layer: Layer, oriented: Array) -> Array:
             normals, votes = hood.columns[:, :3], hood.columns[:, 3]
-            walls = sides.vote_by_thin_walls(hood, layer, raw_spacing, normals, oriented, const)
-            return sides.average_votes(hood, layer, raw_spacing, normals, votes, const) + first * walls
+            walls = sides.vote_by_thin_walls(hood, layer, raw_spacing, normals, oriented)
+            return sides.average_votes(hood, layer, raw_spacing, normals, votes) + first * walls
 
         table = jnp.concatenate([layer.normal, votes[None]])
-        return jnp.clip(map_blocks(combine, points, table, const, raw_spacing, layer, points.oriented), -1, 1), None
+        return jnp.clip(map_blocks(combine, points, table, raw_spacing, layer, points.oriented), -1, 1), None
 
-    votes = (front - back) / (front + back + const.vote_ridge)
+    votes = (front - back) / (front + back + CONSTANTS.vote_ridge)
     towards, _ = jax.lax.scan(vote, votes, jnp.asarray([1, 0], raw_spacing.dtype))
-    return sides.orient_normals(turned, towards, points.oriented, const)
+    return sides.orient_normals(turned, towards, points.oriented)
 
 
 def describe_discs(
@@ -383,10 +379,9 @@ def describe_discs(
     one_sided: Float[Array, " points"],
     visibility: Float[Array, "64 points"],
     random: Bool[Array, ""],
-    const: Constants = CONSTANTS,
 ) -> dict[str, Array]:
     """The fields of `Surfels` that follow from layers and sides (..., points); gaps of random points are covered."""
-    layer_spacing, weight = measure_spacings(points, raw_spacing, layer, normal, one_sided, const)
+    layer_spacing, weight = measure_spacings(points, raw_spacing, layer, normal, one_sided)
 
     def work(
         hood: Neighborhood,
@@ -397,18 +392,18 @@ def describe_discs(
         one_sided: Array,
     ) -> dict[str, Array]:
         normals, colors, neighbors_one_sided, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
-        axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0], const)
+        axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0])
         flat = jnp.stack([project_on(hood.offset, axis) for axis in axes[:2]], axis=1)
-        wider = discs.bridge_gaps(flat / spacing[None, None], weight, const)
+        wider = discs.bridge_gaps(flat / spacing[None, None], weight)
         wider = jnp.where(random, wider, 1)
         spacing = spacing * wider
         uv = jax.lax.optimization_barrier(flat / spacing[None, None])
-        nearby = (weight > 0.5) & (hood.squared < (const.rim_radius * spacing[None]) ** 2)
-        ends = discs.find_farthest(jnp.where(nearby[:, None], uv, 0)) + (const.rim_margin / wider)[None]
-        clip_lines = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, neighbors_one_sided[:, 0], const)
-        rim_tangent, rim_distances = discs.find_rims(ends, clip_lines, axes, const)
-        color_edge = discs.find_color_edge(uv, weight, spacing, axes, colors, const)
-        own = layers.weigh_distance(hood, raw_spacing, const) * layers.weigh_height(layer)
+        nearby = (weight > 0.5) & (hood.squared < (CONSTANTS.rim_radius * spacing[None]) ** 2)
+        ends = discs.find_farthest(jnp.where(nearby[:, None], uv, 0)) + (CONSTANTS.rim_margin / wider)[None]
+        clip_lines = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, neighbors_one_sided[:, 0])
+        rim_tangent, rim_distances = discs.find_rims(ends, clip_lines, axes)
+        color_edge = discs.find_color_edge(uv, weight, spacing, axes, colors)
+        own = layers.weigh_distance(hood, raw_spacing) * layers.weigh_height(layer)
         return color_edge | {
             "spacing": spacing,
             "shape_ratios": measure_shape(layers.measure_covariance(hood, raw_spacing, own)),
@@ -417,23 +412,22 @@ def describe_discs(
         }
 
     table = jnp.concatenate([normal, points.color, one_sided[None], layer_spacing[None]])
-    fields = map_blocks(work, points, table, const, raw_spacing, layer, weight, normal, one_sided)
-    return fields | {"visibility": average_visibility(points, weight, visibility, const)}
+    fields = map_blocks(work, points, table, raw_spacing, layer, weight, normal, one_sided)
+    return fields | {"visibility": average_visibility(points, weight, visibility)}
 
 
 def average_visibility(
     points: PointColumns,
     weight: Float[Array, "k points"],
     visibility: Float[Array, "64 points"],
-    const: Constants = CONSTANTS,
 ) -> Float[Array, "64 points"]:
     """Visibility averaged over the nearest neighbors on the same layer: a depth buffer of points is noisy."""
-    size, rows, weight = min(const.block_size, len(points.mask)), visibility.T, jax.lax.stop_gradient(weight)
+    size, rows, weight = min(CONSTANTS.block_size, len(points.mask)), visibility.T, jax.lax.stop_gradient(weight)
 
     def one(block: tuple[Array, Array]) -> Array:
         return discs.average_rows(*block, rows)
 
-    count = const.averaged_neighbors
+    count = CONSTANTS.averaged_neighbors
     near = _split(points.neighbors[:count], size, -1), _split(weight[:count], size, 1)
     return jax.lax.map(one, near).reshape(-1, len(visibility))[: len(points.mask)].T
 
@@ -444,17 +438,16 @@ def measure_spacings(
     layer: Layer,
     normal: Float[Array, "3 points"],
     one_sided: Float[Array, " points"],
-    const: Constants = CONSTANTS,
 ) -> tuple[Float[Array, " points"], Float[Array, "k points"]]:
     """Spacings, and weights of the neighbors as members of the same layer."""
 
     def weigh(
         hood: Neighborhood, raw_spacing: Array, layer: Layer, normal: Array, one_sided: Array
     ) -> tuple[Array, Array]:
-        weight = layers.weigh_layer(hood, layer, normal, one_sided, hood.columns, const)
-        return discs.measure_layer_spacing(hood, weight, raw_spacing, const), weight
+        weight = layers.weigh_layer(hood, layer, normal, one_sided, hood.columns)
+        return discs.measure_layer_spacing(hood, weight, raw_spacing), weight
 
-    return map_blocks(weigh, points, normal, const, raw_spacing, layer, normal, one_sided)
+    return map_blocks(weigh, points, normal, raw_spacing, layer, normal, one_sided)
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -471,7 +464,7 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     del params
     check_inputs(cloud, neighbors, "encode")
     inside, centre, scale = normalise_cloud(cloud)
-    return make_scene(inside, neighbors, centre, scale, CONSTANTS)
+    return make_scene(inside, neighbors, centre, scale)
 
 
 def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
@@ -517,9 +510,8 @@ def make_scene(
     neighbors: Int[AnyArray, "points 20"],
     centre: Array,
     scale: Array,
-    const: Constants,
 ) -> SurfelScene:
     """The scene of a cloud that is already in the box; centre and scale are those of its transform."""
-    surfels = estimate_surfels(cloud, jnp.asarray(neighbors), const)
+    surfels = estimate_surfels(cloud, jnp.asarray(neighbors))
     spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
     return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)

@@ -206,9 +206,9 @@ def _pull_back_projection(primals: tuple[Array, Array], cotangents: tuple[Array,
 project_on_axes = with_gradient(_plain_project_on_axes, _pull_back_projection)
 
 
-def weigh_distance(hood: Neighborhood, spacing: Float[Array, " block"], const: Constants) -> Float[Array, "k block"]:
+def weigh_distance(hood: Neighborhood, spacing: Float[Array, " block"]) -> Float[Array, "k block"]:
     """Weights of the neighbors by their distance."""
-    return hood.real * jnp.exp(hood.squared * (-0.5 / (const.distance_sigma * spacing) ** 2)[None])
+    return hood.real * jnp.exp(hood.squared * (-0.5 / (CONSTANTS.distance_sigma * spacing) ** 2)[None])
 
 
 def weigh_height(layer: Layer, factor: float = 1.0) -> Float[Array, "k block"]:
@@ -227,32 +227,32 @@ def measure_covariance(
     return sums[1:, 1:] - sums[1:, :1] * sums[:1, 1:]
 
 
-def fit_planes(hood: Neighborhood, spacing: Float[Array, " block"], const: Constants) -> Float[Array, "3 block"]:
+def fit_planes(hood: Neighborhood, spacing: Float[Array, " block"]) -> Float[Array, "3 block"]:
     """Unit normals: of the planes through the point and two of its nearest neighbors, the one with the largest support.
 
     The least-squares plane is a candidate, too.  So a point at an edge gets the plane of one face, not an average of
     both.  The choice of the plane is constant for gradients; its normal has a gradient.
     """
-    weight = weigh_distance(hood, spacing, const)
+    weight = weigh_distance(hood, spacing)
     narrowest = find_narrowest(measure_covariance(hood, spacing, weight))
-    pairs = np.array(list(combinations(range(1, const.plane_neighbors + 1), 2)), np.int32)
+    pairs = np.array(list(combinations(range(1, CONSTANTS.plane_neighbors + 1), 2)), np.int32)
     fixed = (hood.offset / spacing[None, None], hood.squared / spacing[None] ** 2, hood.real, narrowest, weight)
     offset, squared, real, constant, weight = jax.lax.optimization_barrier(jax.lax.stop_gradient(fixed))
 
     def support(normal: Array) -> Array:
-        return sum_first(weight / (1 + (project_on(offset, normal) / const.plane_height) ** 2))
+        return sum_first(weight / (1 + (project_on(offset, normal) / CONSTANTS.plane_height) ** 2))
 
     def compare(best: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
         one, two = pair
         across = cross(offset[one], offset[two])
         size = dot(across, across)
-        spans = (size > const.least_plane_sine**2 * squared[one] * squared[two]) & (real[one] * real[two] > 0)
+        spans = (size > CONSTANTS.least_plane_sine**2 * squared[one] * squared[two]) & (real[one] * real[two] > 0)
         supported = jnp.where(spans, support(unit(across)), 0)
         better = supported > best[0]
         return (jnp.where(better, supported, best[0]), jnp.where(better[None], pair[:, None], best[1])), None
 
     none = jnp.zeros((2, len(spacing)), jnp.int32)
-    _, chosen = jax.lax.scan(compare, (const.least_squares_bonus * support(constant), none), jnp.asarray(pairs))[0]
+    _, chosen = jax.lax.scan(compare, (CONSTANTS.least_squares_bonus * support(constant), none), jnp.asarray(pairs))[0]
     one, two = (jnp.take_along_axis(hood.offset, which[None, None], axis=0)[0] for which in chosen)
     return jnp.where(chosen[:1] > 0, unit(cross(one / spacing[None], two / spacing[None])), narrowest)
 
@@ -261,16 +261,14 @@ def init_normals(
     hood: Neighborhood,
     spacing: Float[Array, " block"],
     given: Float[Array, "3 block"] | None = None,
-    *,
-    const: Constants,
 ) -> tuple[Float[Array, "3 block"], Bool[Array, " block"]]:
     """Initial unit normals, and which are fixed: given ones; where none is given (or 0), planes are fitted."""
     if given is None:
-        return fit_planes(hood, spacing, const), jnp.zeros(spacing.shape, bool)
+        return fit_planes(hood, spacing), jnp.zeros(spacing.shape, bool)
     fixed_normal = dot(given, given) > 0.5
 
     def complete() -> Array:
-        return select(fixed_normal, given, fit_planes(hood, spacing, const))
+        return select(fixed_normal, given, fit_planes(hood, spacing))
 
     return jax.lax.cond(jnp.all(fixed_normal | (hood.real[0] == 0)), lambda: given, complete), fixed_normal
 
@@ -282,7 +280,6 @@ def fit_layers(
     weight: Float[Array, "k block"],
     fixed_normal: Bool[Array, " block"],
     color_distance: Float[Array, "k block"] | None,
-    const: Constants,
 ) -> tuple[Layer, SplitLayer | None]:
     """Layers from initial normals (fixed ones are kept), and split layers if a color distance is given.
 
@@ -302,26 +299,26 @@ def fit_layers(
         return QuadricFit(layer, weight, sums, jnp.zeros_like(spacing))
 
     if color_distance is None:
-        initial = init(normal, const.first_thickness)
-        return _fit_quadric(offset, weight, initial, None, const.thickness_bounds[0], free, const).layer, None
-    two_colors = _smaller_weight(sum_first(weight), sum_first(weight * color_distance)) > const.step_points[0]
+        initial = init(normal, CONSTANTS.first_thickness)
+        return _fit_quadric(offset, weight, initial, None, CONSTANTS.thickness_bounds[0], free).layer, None
+    two_colors = _smaller_weight(sum_first(weight), sum_first(weight * color_distance)) > CONSTANTS.step_points[0]
 
     def fit(normal: Array, with_step: Array) -> tuple[Array, QuadricFit]:
-        initial = init(normal, jnp.where(with_step, const.thickness_bounds[1], const.first_thickness))
+        initial = init(normal, jnp.where(with_step, CONSTANTS.thickness_bounds[1], CONSTANTS.first_thickness))
         least_thickness = jnp.broadcast_to(
-            jnp.where(with_step, const.split_thickness, const.thickness_bounds[0]), spacing.shape
+            jnp.where(with_step, CONSTANTS.split_thickness, CONSTANTS.thickness_bounds[0]), spacing.shape
         )
         fit_slopes = jnp.where(with_step, 1, free)
 
         def fit_quadric() -> QuadricFit:
-            return _fit_quadric(offset, weight, initial, with_step * color_distance, least_thickness, fit_slopes, const)
+            return _fit_quadric(offset, weight, initial, with_step * color_distance, least_thickness, fit_slopes)
 
         found = jax.lax.cond(~with_step | jnp.any(two_colors), fit_quadric, lambda: initial)
         return found.layer.normal, found
 
     _, fits = jax.lax.scan(fit, normal, jnp.array([False, True]))
     first, stepped = (jax.tree.map(lambda x, i=i: x[i], fits) for i in (0, 1))
-    possible, certain = _test_split(stepped, color_distance, const)
+    possible, certain = _test_split(stepped, color_distance)
     return first.layer, SplitLayer(stepped.layer, possible & two_colors, certain & two_colors)
 
 
@@ -332,13 +329,12 @@ def _fit_quadric(
     color_distance: Float[Array, "k block"] | None,
     least_thickness: Float[Array, " block"] | float,
     fit_slopes: Float[Array, " block"],
-    const: Constants,
 ) -> QuadricFit:
     """Fit in rounds; each weighs the neighbors by their height above the layer of the round before.
 
     Neighbors of another color lie one step off the quadric.  With `fit_slopes` 0, the normals are kept.
     """
-    ridge = _ridge(const, weight.dtype)[: len(initial.sums), : len(initial.sums)]
+    ridge = _ridge(weight.dtype)[: len(initial.sums), : len(initial.sums)]
 
     def improve(_: Array, last: tuple[QuadricFit, Array]) -> tuple[QuadricFit, Array]:
         (_, thickness, _), rest = last[0].layer, last[1]
@@ -356,26 +352,26 @@ def _fit_quadric(
             rest = height - solution[5][None] * color_distance
         normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
         away = sum_first(own * jnp.abs(rest)) / larger(sum_first(own) - 1, 0.5)  # the point itself is at 0
-        thickness = clamp(const.thickness_per_deviation * away, least_thickness, const.thickness_bounds[1])
+        thickness = clamp(CONSTANTS.thickness_per_deviation * away, least_thickness, CONSTANTS.thickness_bounds[1])
         return QuadricFit(Layer(normal, thickness, height), own, sums[:, :-1], solution[-1]), rest
 
-    return jax.lax.fori_loop(0, const.fit_rounds, improve, (initial, initial.layer.height))[0]
+    return jax.lax.fori_loop(0, CONSTANTS.fit_rounds, improve, (initial, initial.layer.height))[0]
 
 
-def _ridge(const: Constants, dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
+def _ridge(dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
     """Ridge terms of the normal equations for slopes, curvatures, and the step between two colors."""
-    bend = const.bend_ridge
-    ridge = [const.slope_ridge, const.slope_ridge, bend, const.mixed_ridge, bend, const.step_ridge]
+    bend = CONSTANTS.bend_ridge
+    ridge = [CONSTANTS.slope_ridge, CONSTANTS.slope_ridge, bend, CONSTANTS.mixed_ridge, bend, CONSTANTS.step_ridge]
     return jnp.diag(jnp.asarray(ridge, dtype))[..., None]
 
 
 def _test_split(
-    fit: QuadricFit, color_distance: Float[Array, "k block"], const: Constants
+    fit: QuadricFit, color_distance: Float[Array, "k block"]
 ) -> tuple[Bool[Array, " block"], Bool[Array, " block"]]:
     """Whether the step separates two surfaces: possibly, and certainly."""
     step, own = fit.step, fit.weight
     last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
-    error = jnp.maximum(solve(fit.sums + _ridge(const, step.dtype), last)[-1, 0], 1e-9)
+    error = jnp.maximum(solve(fit.sums + _ridge(step.dtype), last)[-1, 0], 1e-9)
     total_weight, other_weight, squares = (
         sum_first(own),
         sum_first(own * color_distance),
@@ -387,9 +383,9 @@ def _test_split(
     high = jnp.abs(step) / fit.layer.thickness
     independence = 1 / (step_alone * error)
     smaller_weight = _smaller_weight(total_weight, other_weight)
-    significance = high * const.thickness_per_deviation / jnp.sqrt(error)
+    significance = high * CONSTANTS.thickness_per_deviation / jnp.sqrt(error)
     measured = high, independence, smaller_weight, significance
-    limits = const.step_height, const.step_independence, const.step_points, const.step_significant
+    limits = CONSTANTS.step_height, CONSTANTS.step_independence, CONSTANTS.step_points, CONSTANTS.step_significant
     passed = [[value > limit[i] for value, limit in zip(measured, limits, strict=True)] for i in (0, 1)]
     return jnp.all(jnp.stack(passed[0]), axis=0), jnp.all(jnp.stack(passed[1]), axis=0)
 
@@ -400,20 +396,17 @@ def keep_agreed_splits(
     split: SplitLayer,
     color_distance: Float[Array, "k block"],
     certain: Float[Array, "k block"],
-    const: Constants,
 ) -> Layer:
     """The layers; split ones where enough neighbors of similar color are certain."""
     like = (hood.real * (1 - color_distance))[1:]
-    sure = sum_first(like * certain[1:]) > const.split_share * jnp.maximum(sum_first(like), 1e-6)
+    sure = sum_first(like * certain[1:]) > CONSTANTS.split_share * jnp.maximum(sum_first(like), 1e-6)
     return jax.tree.map(lambda new, old: select(split.possible & sure, new, old), split.layer, layer)
 
 
-def measure_color_distance(
-    hood: Neighborhood, roots: Float[Array, "k 3 block"], const: Constants
-) -> Float[Array, "k block"]:
+def measure_color_distance(hood: Neighborhood, roots: Float[Array, "k 3 block"]) -> Float[Array, "k block"]:
     """Difference in color between each neighbor and the point, 0 to 1, in square roots of linear colors."""
     change = roots - roots[:1]
-    return -jnp.expm1(-0.5 / const.color_sigma**2 * jnp.sum(change**2, axis=1)) * hood.real
+    return -jnp.expm1(-0.5 / CONSTANTS.color_sigma**2 * jnp.sum(change**2, axis=1)) * hood.real
 
 
 def _smaller_weight(
@@ -429,9 +422,8 @@ def weigh_layer(
     normal: Float[Array, "3 block"],
     one_sided: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
-    const: Constants,
 ) -> Float[Array, "k block"]:
     """Weight of each neighbor as a member of the same layer: close to the quadric, normal to the same side."""
-    weight = hood.real * weigh_height(layer, const.loose_thickness)
+    weight = hood.real * weigh_height(layer, CONSTANTS.loose_thickness)
     weight = weight * jnp.where((one_sided > 0.5)[None], clamp(0.5 + project_on(normals, normal), 0, 1), 1)
     return jax.lax.optimization_barrier(jnp.concatenate([jnp.ones_like(weight[:1]), weight[1:]]))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import clamp, dot, sum_first
-from spnr_jax.surfels.layers import Constants, Layer, Neighborhood, project_on, weigh_distance, weigh_height
+from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on, weigh_distance, weigh_height
 
 # --- visibility -------------------------------------------------------------------------------------------------------
 
@@ -133,11 +133,10 @@ def average_votes(
     spacing: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
     votes: Float[Array, "k block"],
-    const: Constants,
 ) -> Float[Array, " block"]:
     """Mean vote of each point and its neighbors on the same layer; opposite normals count with the opposite sign."""
     cosine = project_on(normals, layer.normal)
-    weight = weigh_distance(hood, spacing, const) * weigh_height(layer) * cosine**2
+    weight = weigh_distance(hood, spacing) * weigh_height(layer) * cosine**2
     return sum_first(weight * jnp.sign(cosine) * votes) / jnp.maximum(sum_first(weight), 1e-6)
 
 
@@ -147,7 +146,6 @@ def vote_by_thin_walls(
     spacing: Float[Array, " block"],
     normals: Float[Array, "k 3 block"],
     oriented: Bool[Array, " block"],
-    const: Constants,
 ) -> Float[Array, " block"]:
     """The vote of a parallel layer just behind: the two sides of a thin wall face away from each other.
 
@@ -155,26 +153,28 @@ def vote_by_thin_walls(
     apart.
     """
     cosine = project_on(normals, layer.normal)
-    other = jnp.where(oriented[None], -cosine, jnp.abs(cosine)) > const.parallel_cosine
-    wall = weigh_distance(hood, spacing, const) * other * (jnp.abs(layer.height) < const.thin_wall_height)
-    thin = oriented & (layer.thickness <= const.thickness_bounds[0])
-    thickness = jnp.where(thin, const.split_thickness, layer.thickness)
+    other = jnp.where(oriented[None], -cosine, jnp.abs(cosine)) > CONSTANTS.parallel_cosine
+    wall = weigh_distance(hood, spacing) * other * (jnp.abs(layer.height) < CONSTANTS.thin_wall_height)
+    thin = oriented & (layer.thickness <= CONSTANTS.thickness_bounds[0])
+    thickness = jnp.where(thin, CONSTANTS.split_thickness, layer.thickness)
     outward = layer.height / thickness[None]
-    above, below = sum_first(wall * (outward > const.other_layer)), sum_first(wall * (outward < -const.other_layer))
-    return const.thin_wall_weight * (below - above) / (above + below + const.vote_ridge)
+    above, below = (
+        sum_first(wall * (outward > CONSTANTS.other_layer)),
+        sum_first(wall * (outward < -CONSTANTS.other_layer)),
+    )
+    return CONSTANTS.thin_wall_weight * (below - above) / (above + below + CONSTANTS.vote_ridge)
 
 
 def orient_normals(
     normal: Float[Array, "3 block"],
     vote: Float[Array, " block"],
     oriented: Bool[Array, " block"],
-    const: Constants,
 ) -> tuple[Float[Array, "3 block"], Float[Array, " block"]]:
     """Normals that point outward, and `one_sided`: near 1 where the votes decide which side that is, else 0.
 
     Given normals are oriented; they are flipped only where the votes are clear.
     """
-    begin, end = const.orientation_ramp
-    one_sided = clamp((jnp.abs(vote) - begin) / (end - begin), 0, 1 - const.back_weight)
-    wrong = vote < jnp.where(oriented, -const.flip_vote, 0)
+    begin, end = CONSTANTS.orientation_ramp
+    one_sided = clamp((jnp.abs(vote) - begin) / (end - begin), 0, 1 - CONSTANTS.back_weight)
+    wrong = vote < jnp.where(oriented, -CONSTANTS.flip_vote, 0)
     return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(one_sided)

@@ -6,6 +6,7 @@ gradient jumps.
 """
 
 import dataclasses
+from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -145,7 +146,7 @@ def covariance_twin(offset, spacing):
 
 def spacings(offset):
     """From the discs that hold some of the neighbours, whatever their layer."""
-    return discs.measure_raw_spacing(hood_of(offset), CONSTANTS)
+    return discs.measure_raw_spacing(hood_of(offset))
 
 
 def spacings_twin(offset):
@@ -165,9 +166,8 @@ def quadric(offset, spacing):
     up = jnp.stack([jnp.zeros_like(spacing), jnp.zeros_like(spacing), jnp.ones_like(spacing)])
     weight = jnp.exp(-0.2 * jnp.sum((offset / spacing[None, None]) ** 2, axis=1))
     free = jnp.zeros(spacing.shape, bool)
-    layer, _ = layers.fit_layers(
-        hood_of(offset), spacing, up, weight, free, None, dataclasses.replace(CONSTANTS, fit_rounds=1)
-    )
+    with mock.patch.object(layers, "CONSTANTS", dataclasses.replace(CONSTANTS, fit_rounds=1)):
+        layer, _ = layers.fit_layers(hood_of(offset), spacing, up, weight, free, None)
     return layer.normal, layer.height
 
 
@@ -184,7 +184,7 @@ def borders(place, colors):
     place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return tuple(discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors, CONSTANTS).values())
+    return tuple(discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors).values())
 
 
 def parted(rng, size):

@@ -50,7 +50,7 @@ def test_one_colour_a_gradient_and_speckles_have_no_borders():
         assert np.mean(np.abs(jump).max(axis=1) > 0.1) <= most
 
 
-bridge = jax.jit(discs.bridge_gaps, static_argnums=2)
+bridge = jax.jit(discs.bridge_gaps)
 
 
 def widened(points):
@@ -58,7 +58,7 @@ def widened(points):
     spacing = np.full(len(points), 1 / np.sqrt(len(points)), np.float32)
     near = nearest(np.pad(points, ((0, 0), (0, 1)))).T
     place = np.float32(((points[near] - points[None]) / spacing[0]).transpose(0, 2, 1))
-    return np.asarray(bridge(jnp.asarray(place), jnp.ones(near.shape), CONSTANTS)), spacing
+    return np.asarray(bridge(jnp.asarray(place), jnp.ones(near.shape))), spacing
 
 
 def gaps(points, spacing):
