@@ -1,12 +1,13 @@
-"""A folder of results: whose it is, what was made for it, and the files that a person reads.
+"""A results folder: the request that it belongs to, cached intermediate results, tables and pictures.
 
     OUT/asked.json     what was asked for; another request is refused, because its results would be mixed in
     OUT/results.json   every number and its conditions
     OUT/table.md       and the pictures
 
-What was made stands in files of its own, so that the same command goes on where it was stopped.
+Intermediate results have files of their own, so that the same command continues where it was stopped.
 """
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,12 +19,11 @@ from PIL import Image
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.scoring.report import Cell, Table
-from spnr_jax.training import trainer
 
 
 def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | None = None) -> None:
-    """Makes a folder that of a request (on a data set); ValueError if it is another's."""
-    asked = {"of": what, **asked} | ({} if dataset is None else {"data": trainer.checksum(dataset)})
+    """Records a request (on a data set) in its folder; ValueError if the folder belongs to another one."""
+    asked = {"of": what, **asked} | ({} if dataset is None else {"data": checksum(dataset)})
     path = folder / "asked.json"
     if path.is_file():
         there = json.loads(path.read_text())
@@ -33,13 +33,19 @@ def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | 
         images.write_whole(path, as_json(asked))
 
 
+def checksum(dataset: data_sets.Dataset) -> str:
+    """A checksum of a data set's settings and object names."""
+    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
 def as_json(content: object) -> bytes:
     """The bytes of a JSON file."""
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
 def load_or_make(place: Path, make: Callable[[], Any]) -> Any:
-    """What a file holds: JSON or a picture (.png); it is made if it is not there."""
+    """Content of a file, JSON or a picture (.png); computed and written first if it is missing."""
     if not place.is_file():
         images.write_whole(place, WRITERS[place.suffix](make()))
     return READERS[place.suffix](place)

@@ -23,7 +23,7 @@ from experiments.comparison import figures
 from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cut
-from experiments.comparison.view_scores import measure_sharpness
+from experiments.comparison.view_scores import measure_sharpness, over_white
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData
@@ -112,11 +112,6 @@ def score_view(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) ->
         "flip": float(flip(image, white)),
         "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
     }
-
-
-def over_white(reference: np.ndarray) -> np.ndarray:
-    """RGB of straight-alpha float RGBA over white."""
-    return reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
 
 
 def mean_scores(scores: Mapping[str, Sequence[float]]) -> dict[str, float | None]:

@@ -3,17 +3,15 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
-from spnr_jax.formats.images import to_uint8
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import average_pool
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
+from spnr_jax.training.gbuffers import average_squares
 
 
 def test_objects(dataset: Dataset, count: int | None) -> tuple[str, ...]:
@@ -39,7 +37,7 @@ def cut(
     if resolution and resolution != camera.height:
         if camera.height % resolution:
             raise UserError(f"--resolution {resolution}: not a whole share of the data set's {camera.height} pixels")
-        images = shrink(images, camera.height // resolution)
+        images = np.stack([average_squares(image, camera.height // resolution) for image in images])
         camera = cameras.resize(camera, resolution, resolution)
     return dataclasses.replace(
         item,
@@ -49,14 +47,6 @@ def cut(
         conditions=item.conditions[:views],
         lights=None if item.lights is None else item.lights[:views],
     )
-
-
-def shrink(rgba: np.ndarray, side: int) -> np.ndarray:
-    """8-bit pictures averaged over squares of `side` pixels, colours weighted by their opacity."""
-    pictures = rgba.astype(np.float32) / 255
-    weighted = np.concatenate([pictures[..., :3] * pictures[..., 3:], pictures[..., 3:]], axis=-1)
-    weighted = np.asarray(average_pool(jnp.asarray(weighted), side))
-    return to_uint8(np.concatenate([weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-4), weighted[..., 3:]], -1))
 
 
 def each_view(item: ObjectData) -> list[Camera]:

@@ -32,26 +32,32 @@ def measure_sharpness(
 ) -> Sharpness:
     """The scores of a picture; NaN where the reference has no pixel for a score."""
     alpha = reference[..., 3]
-    white = reference[..., :3] * alpha[..., None] + 1 - alpha[..., None]
+    white = over_white(reference)
     squared, body = (image - white) ** 2, alpha > 0.5
     outline = binary_dilation(body, iterations=OUTLINE) & ~binary_erosion(body, iterations=OUTLINE)
     deep = binary_erosion(body, iterations=WELL_INSIDE)
     return Sharpness(
         psnr=_decibels(squared),
         psnr_inside=_decibels(squared[alpha > 0.999]),
-        outline_rmse=_mean((opacity - alpha)[outline] ** 2) ** 0.5,
-        holes=100 * _mean(opacity[deep] < SOLID),
+        outline_rmse=mean((opacity - alpha)[outline] ** 2) ** 0.5,
+        holes=100 * mean(opacity[deep] < SOLID),
         detail=_correlation(_residue(image, DETAIL)[deep], _residue(white, DETAIL)[deep]),
     )
 
 
-def _mean(values: np.ndarray) -> float:
+def over_white(reference: Float[np.ndarray, "height width 4"]) -> Float[np.ndarray, "height width 3"]:
+    """RGB of straight-alpha float RGBA over white."""
+    return reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
+
+
+def mean(values: np.ndarray) -> float:
+    """The mean; NaN of nothing."""
     return float(np.mean(values)) if values.size else float("nan")
 
 
 def _decibels(squared: np.ndarray) -> float:
-    mean = _mean(squared)
-    return float(min(-10 * np.log10(mean), 100.0)) if mean > 0 else (100.0 if mean == 0 else mean)
+    error = mean(squared)
+    return float(min(-10 * np.log10(error), 100.0)) if error > 0 else (100.0 if error == 0 else error)
 
 
 def _residue(image: np.ndarray, sigma: float) -> np.ndarray:

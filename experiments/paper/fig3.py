@@ -28,6 +28,7 @@ from experiments.comparison import results_folder, scores
 from experiments.comparison.contenders import Method, of_model
 from experiments.comparison.scores import OPAQUE, Measured
 from experiments.comparison.study_objects import cut, each_view, test_objects
+from experiments.comparison.view_scores import mean
 from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
@@ -142,9 +143,10 @@ def true_depth(positions: np.ndarray, camera: Camera, size: tuple[int, ...]) -> 
     """Distance (*size) of the nearest point (n, 3) in each pixel, of those that the eye sees; inf without one."""
     seen = positions[visible_points(positions - np.asarray(camera.cam_to_world)[:, 3])]
     pixels, distance = map(np.asarray, cameras.project(cameras.resize(camera, *size), jnp.asarray(seen)))
+    inside = np.all((pixels >= 0) & (pixels < size[::-1]), axis=1)  # a point behind the eye has no pixel
+    columns, rows = pixels[inside].astype(int).T
     truth = np.full(size, np.inf)
-    columns, rows = np.floor(pixels).astype(int).clip(0, size[0] - 1).T
-    np.minimum.at(truth, (rows, columns), distance)
+    np.minimum.at(truth, (rows, columns), distance[inside])
     return truth
 
 
@@ -153,11 +155,6 @@ def visible_points(positions: np.ndarray) -> np.ndarray:
     far = np.linalg.norm(positions, axis=1, keepdims=True)
     hull = ConvexHull(np.concatenate([positions * (2 * SPHERE * far.max() / far - 1), np.zeros((1, 3))])).vertices
     return hull[hull < len(positions)]
-
-
-def mean(values: np.ndarray) -> float:
-    """The mean, NaN of nothing."""
-    return float(np.mean(values)) if values.size else np.nan
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import find_extent, first_in_voxels
 
-Values = dict[str, np.ndarray]
 Box = Sequence[float | int]
 
 CROWD = 4.0  # points per voxel, on average

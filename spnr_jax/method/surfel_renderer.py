@@ -165,9 +165,9 @@ def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
-        low = jnp.min(jnp.where(drawn, first, 2**20)), jnp.max(jnp.where(drawn, first + size, 0))
-        begin = jnp.where(jnp.any(drawn), jnp.maximum(low[0] - MARGIN, 0) // GRID * GRID, 0)
-        sides.append((begin, jnp.maximum(round_up(low[1] + MARGIN - begin), STEP)))
+        low, high = jnp.min(jnp.where(drawn, first, 2**20)), jnp.max(jnp.where(drawn, first + size, 0))
+        begin = jnp.where(jnp.any(drawn), jnp.maximum(low - MARGIN, 0) // GRID * GRID, 0)
+        sides.append((begin, jnp.maximum(round_up(high + MARGIN - begin), STEP)))
     (left, width), (top, height) = sides
     return jnp.stack([left, top]), width, height
 

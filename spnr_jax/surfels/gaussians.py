@@ -68,8 +68,8 @@ def evaluate_harmonics(directions: Float[AnyArray, "*batch 3"], degree: int) -> 
 
 def half_turn_signs(degree: int) -> Float[np.ndarray, " coefficients"]:
     """Signs of the coefficients after half a turn of the colour around the x axis: (x, y, z) -> (x, -y, -z)."""
-    place_splats = np.array([0.36, 0.48, 0.8])
-    return np.sign(evaluate_harmonics(place_splats * [1, -1, -1], degree) * evaluate_harmonics(place_splats, degree))
+    direction = np.array([0.36, 0.48, 0.8])
+    return np.sign(evaluate_harmonics(direction * [1, -1, -1], degree) * evaluate_harmonics(direction, degree))
 
 
 STRIDE = 2  # every second pixel of each axis is unprojected

@@ -352,7 +352,7 @@ def orient_layers(
     visibility: Float[Array, "64 points"],
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Normals that point outward, and the confidence in that (`one_sided`)."""
-    turned, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw_spacing, layer))
+    normal, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw_spacing, layer))
     position, raw_spacing, layer = fixed
     points = points._replace(position=position)
     front, back = sides.sum_visibility(layer.normal, visibility)
@@ -368,7 +368,7 @@ def orient_layers(
 
     votes = (front - back) / (front + back + CONSTANTS.vote_ridge)
     towards, _ = jax.lax.scan(vote, votes, jnp.asarray([1, 0], raw_spacing.dtype))
-    return sides.orient_normals(turned, towards, points.oriented)
+    return sides.orient_normals(normal, towards, points.oriented)
 
 
 def describe_discs(

@@ -6,7 +6,6 @@ A run continues from its newest readable checkpoint; the rows of metrics.jsonl a
 be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -271,9 +270,3 @@ def read_rows(run: Path) -> list[dict]:
             break
         rows.append(row)
     return rows
-
-
-def checksum(dataset: data_sets.Dataset) -> str:
-    """A checksum of a data set's settings and object names."""
-    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()

@@ -12,6 +12,7 @@ from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
+from spnr_jax.training.gbuffers import average_squares
 
 
 @pytest.mark.parametrize(
@@ -54,8 +55,7 @@ def test_a_cut_object_has_its_first_points_and_views_in_averaged_pictures():
     assert small.cloud.normals is None
     assert len(small.images) == len(small.camera.cam_to_world) == 2
     assert small.camera.height == tiny_dataset.SIZE // 2
-    two = np.array([[[255, 0, 0, 255], [0, 255, 0, 0]]] * 2, np.uint8)  # what nothing covers has no colour
-    np.testing.assert_array_equal(study_objects.shrink(two[None], 2), [[[[255, 0, 0, 128]]]])
+    np.testing.assert_array_equal(small.images[1], average_squares(item.images[1], 2))
     with pytest.raises(ValueError, match="not a whole share"):
         study_objects.cut(item, resolution=tiny_dataset.SIZE - 1)
 
@@ -79,3 +79,10 @@ def test_what_cannot_be_compared_is_refused_by_name(monkeypatch):
         study_objects.test_objects(dataset, 0)
     with pytest.raises(ValueError, match="the test split is empty"):
         study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None)
+
+
+def test_the_checksum_knows_settings_and_splits():
+    dataset = tiny_dataset.dataset()
+    changes = {"settings": dataset.settings | {"views": 99}}, {"splits": dataset.splits | {"test": ()}}
+    others = [dataclasses.replace(dataset, **change) for change in changes]
+    assert len({results_folder.checksum(d) for d in (dataset, *others)}) == 3
