@@ -164,7 +164,11 @@ class Light:
 
     def __add__(self, other: "Light") -> "Light":
         """The sum of both lights."""
-        return Light(tables=self.tables + other.tables)
+        return Light(tables=self.tables + other.tables) if isinstance(other, Light) else NotImplemented
+
+    def __radd__(self, other: int) -> "Light":
+        """The light itself: `sum` begins with 0."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __mul__(self, factor: float | int) -> "Light":
         """The light with its radiance multiplied by a factor."""
@@ -173,6 +177,10 @@ class Light:
         return Light(tables=factor * self.tables)
 
     __rmul__ = __mul__
+
+    def __truediv__(self, divisor: float | int) -> "Light":
+        """The light with its radiance divided by a number."""
+        return self * (1 / divisor)
 
     def turned(self, degrees: float | int | jax.Array) -> "Light":
         """The light rotated about the up axis: an azimuth (0 at +z, 90 at +x) increases by `degrees`.

@@ -102,6 +102,8 @@ class Model:
         The surfel network uses common array sizes for all frames, so that it is compiled once.
         """
         _check_quality(quality)
+        if not isinstance(volume, Volume):
+            raise UserError(f"render: expected a volume of Model.encode, got {type(volume).__name__}")
         lights = lights or [None] * len(views)
         for light in lights:
             check_light(light)

@@ -87,6 +87,8 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     batch, tails = np.shape(camera.cam_to_world)[:-2], [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
     if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
         raise UserError(f"plan: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
+    if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
+        raise UserError("plan: a focal length of camera.intrinsics is 0 or negative; expected pixels")
     objects = np.shape(scene.spacing)
     if batch[: len(objects)] != objects:
         if batch:
@@ -216,6 +218,8 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
     ):
         if np.shape(array) != wanted:
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
+    if not isinstance(plan, Plan):
+        raise UserError(f"render: expected plan=spnr_jax.plan(scene, camera), got {type(plan).__name__}")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
 

@@ -22,10 +22,14 @@ CALLS = {
     "plan(scene, camera.replace(intrinsics=np.full((3, 3), np.nan)))": "plan: expected a finite pose",
     "plan(cloud, camera)": "plan: expected a scene of spnr_jax.encode, or volume.scene, got PointCloud",
     "render(None, scene, camera, 'studio', plan=plan(scene, camera))": "light: expected a Light, as spnr_jax.read",
+    "plan(scene, camera.replace(intrinsics=-camera.intrinsics))": "plan: a focal length of camera.intrinsics is",
+    "render(None, scene, camera, plan=None)": "render: expected plan=spnr_jax.plan(scene, camera), got NoneType",
+    "model.render(scene, camera)": "render: expected a volume of Model.encode, got SurfelScene",
+    "light + 1": "unsupported operand type",
     "render(None, cloud, camera, plan=None)": "render: expected a scene of spnr_jax.encode",
     "model.encode(jax.tree.map(lambda x: x[None], cloud))": "encode: cloud.mask has the shape (1, 9)",
-    "model.render(None, camera, light='studio')": "light: expected a Light",
-    "model.render(None, camera, light=jax.tree.map(lambda x: x[:6], light))": "light.tables has the shape (6, 32",
+    "model.render(volume, camera, light='studio')": "light: expected a Light",
+    "model.render(volume, camera, light=jax.tree.map(lambda x: x[:6], light))": "light.tables has the shape (6, 32",
     "model.camera(scene, resolution=0)": "resolution must be at least 1 pixel, got 0",
     "light * light": "unsupported operand type",
     "spnr_jax.light_of(np.ones((64, 64, 3)))": "light_of: expected a map (height, 2 height, 3), got (64, 64, 3)",
@@ -47,7 +51,7 @@ rows = np.random.default_rng(0).random((4, 9, 3)).astype(np.float32)
 cloud = make_cloud(*rows[:2], *rows[2:, :, 0])
 near, light, model = neighbors(cloud), spnr_jax.sun(40, 30), spnr_jax.load()
 scene = jax.jit(encode)(None, cloud, near)
-camera = model.camera(scene, resolution=16)
+camera, volume = model.camera(scene, resolution=16), spnr_jax.Volume(scene, scene.centre, scene.scale)
 said = []
 for call in json.loads(sys.argv[1]):
     try:
