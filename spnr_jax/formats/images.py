@@ -132,12 +132,16 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
 
 
 def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
-    """A GIF that loops; all frames share one palette, or still surfaces would flicker."""
+    """A GIF that loops; all frames share one palette, or still surfaces would flicker; the background is exact."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
     step = max(min(pictures[0].shape[:2]) // PALETTE_PIXELS, 1)  # of 24 frames of 512 pixels whole, 5.9 s
     strip = Image.fromarray(np.concatenate([pictures[i][::step, ::step] for i in chosen]))
     palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    background, colors, place = pictures[0][0, 0], palette.getpalette() or [], int(np.asarray(palette)[0, 0])
+    palette.putpalette([*colors[: 3 * place], *background.tolist(), *colors[3 * place + 3 :]])
     images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    for image, picture in zip(images, pictures, strict=True):  # Pillow takes any color nearby
+        image.paste(place, None, Image.fromarray((picture == background).all(axis=-1)))
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
     images[0].save(

@@ -70,6 +70,19 @@ def test_a_turntable_gif_loops_at_its_rate_and_shows_every_frame_with_a_pure_whi
     assert error.max() <= 12
 
 
+@pytest.mark.parametrize("background", [1.0, 0.4])
+def test_the_background_of_a_gif_is_exact_beside_colours_that_are_nearly_its(tmp_path, background):
+    frames = [frame * background for frame in shaded_frames(4)]
+    for frame in frames:
+        frame[20:] = np.where(
+            frame[20:] == background, background * np.linspace(0.96, 1, frame.shape[1])[:, None], frame[20:]
+        )
+    path, _ = write_turntable(tmp_path / "a.gif", frames, fps=20)
+    with Image.open(path) as film:
+        shown = np.stack([np.asarray(film.convert("RGB")) for i in range(film.n_frames) if not film.seek(i)])
+    np.testing.assert_array_equal(shown[:, 0, 0], to_uint8(np.full((4, 3), background)))
+
+
 def test_an_mp4_without_its_encoder_becomes_a_gif_and_one_line_says_why(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     path, reason = write_turntable(tmp_path / "a.mp4", shaded_frames(3), fps=10)
