@@ -386,18 +386,18 @@ def _check_values(points: Points, report: Report) -> None:
     thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / max(measure_spacing(tree), 1e-300)
     if THIN[0] < thickness < THIN[1]:
         report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
-    if "normals" in values and (reason := _doubt(positions, values["normals"])):
+    if "normals" in values and (reason := _doubt(positions, tree, values["normals"])):
         report(f"normals of the file left out: {reason}")
         del values["normals"]
 
 
-def _doubt(positions: np.ndarray, normals: np.ndarray) -> str:
+def _doubt(positions: np.ndarray, tree: cKDTree, normals: np.ndarray) -> str:
     """Why normals (n, 3), 0 where unknown, are not those of the surface of the points; empty if they may be."""
     known = np.flatnonzero(normals.any(axis=1))
     if len(known) < LEAST_POINTS:
         return ""
     rows = known[:: -(-len(known) // SAMPLE)]
-    surface = estimate_normals(positions[rows], positions)
+    surface = estimate_normals(positions[rows], tree)
     if np.abs(normals[rows] @ normals[rows[0]]).min() > 1 - 1e-6:
         fits = float(np.mean(np.abs(surface @ normals[rows[0]]) > PARALLEL))
         return "all are the same, and the points lie in no plane" if fits < PARALLEL else ""

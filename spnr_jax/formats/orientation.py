@@ -53,7 +53,7 @@ def find_up(positions: np.ndarray, kind: str) -> tuple[str, str]:
     if kind in BY_FORMAT:
         return BY_FORMAT[kind], f"by the format {kind}"
     positions = positions[:: -(-len(positions) // MOST_STANDING)]
-    normals = estimate_normals(positions, positions)
+    normals = estimate_normals(positions, cKDTree(positions))
     scores = {axis: standing(positions, normals, "xyz".index(axis)) for axis in "yz"}
     up = "z" if scores["z"] > scores["y"] + MARGIN else "y"
     return up, f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"

@@ -32,19 +32,14 @@ TINY = np.finfo(np.float64).tiny
 
 
 def estimate_normals(
-    positions: Float[np.ndarray, "points 3"], among: Float[np.ndarray, "all 3"], noise: float = 0.0
+    positions: Float[np.ndarray, "points 3"], tree: cKDTree, noise: float = 0.0
 ) -> Float[np.ndarray, "points 3"]:
-    """Unit normals, of either sign, at some points, from all points of their cloud (`among`).
+    """Unit normals, of either sign, at some points, from the k-d tree of all points of their cloud.
 
     Each is the normal of the least-squares plane of the neighbours.  Each round gives less weight to neighbours off the
     previous plane, so that a point at an edge gets one of its faces (robust moving least squares, Fleishman et al.
     2005). `noise` is the standard deviation of the points before they were averaged: it enlarges the neighbourhood.
     """
-    return _estimate_normals(positions, cKDTree(among), noise)
-
-
-def _estimate_normals(positions: np.ndarray, tree: cKDTree, noise: float) -> np.ndarray:
-    """The normals of `estimate_normals`, from a k-d tree of all points."""
     spacing = _measure_spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
@@ -80,7 +75,7 @@ def face_sensor(
     One sensor sees only one side of each surface, so all heights above the planes count as noise, depth steps included.
     """
     tree = cKDTree(among)
-    normals = _estimate_normals(positions, tree, max(noise, ROUGH * _measure_thickness(tree)))
+    normals = estimate_normals(positions, tree, max(noise, ROUGH * _measure_thickness(tree)))
     towards = np.einsum("ni,ni->n", normals, sensor - positions)
     return np.where(towards[:, None] < 0, -normals, normals)
 
@@ -161,7 +156,7 @@ def outward_normals(
     voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
     low, high = positions.min(axis=0), positions.max(axis=0)
     half = np.linalg.norm(high - low) / 2 or 1.0
-    in_box = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)  # in the box
+    in_box = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)
     order, near = order_in_space(in_box)
     size = cloud_arrays.bucket(len(order))
 
@@ -169,7 +164,7 @@ def outward_normals(
         return jnp.asarray(np.pad(values.T, [(0, 0), (0, size - len(order))], constant_values=fill))
 
     color = np.asarray(base_color[voters], np.float32)
-    normal = np.asarray(estimate_normals(positions[voters], positions, noise), np.float32)
+    normal = np.asarray(estimate_normals(positions[voters], cKDTree(positions), noise), np.float32)
     points = PointColumns(
         neighbors=columns(near, -1),
         mask=jnp.arange(size) < len(order),

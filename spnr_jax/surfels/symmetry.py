@@ -132,9 +132,7 @@ def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:
     position = np.asarray(cloud.positions, np.float64)
     tree = cKDTree(position)
     _, around, spacing = measure_distances(tree)
-    normal = (
-        estimate_normals(position, position) if cloud.normals is None else unit(np.asarray(cloud.normals, np.float64))
-    )
+    normal = estimate_normals(position, tree) if cloud.normals is None else unit(np.asarray(cloud.normals, np.float64))
     return Surface(position, normal, spacing, limits, around, tree)
 
 
