@@ -58,10 +58,10 @@ def draw_reshaping(seed: int) -> Reshaping:
 
 def reshape(asset: Asset, reshaping: Reshaping) -> Asset:
     """The asset in its new shape; a mirror image's faces are turned round, so that they still face outwards."""
-    return replace(asset, parts=tuple(reshaped_part(part, reshaping) for part in asset.parts))
+    return replace(asset, parts=tuple(reshape_part(part, reshaping) for part in asset.parts))
 
 
-def reshaped_part(part: Part, reshaping: Reshaping) -> Part:
+def reshape_part(part: Part, reshaping: Reshaping) -> Part:
     """A part with its positions, normals, faces and roughness changed."""
     matrix = reshaping.matrix()
     normals = part.normals
@@ -99,7 +99,7 @@ class ColourRotation:
 def rotate_colours(asset: Asset, seed: int) -> tuple[Asset, ColourRotation]:
     """The asset with its base colours rotated, and the rotation, a function of the colours and the seed."""
     rotation = draw_rotation(base_colours(asset), seed)
-    return replace(asset, parts=tuple(rotated_part(part, rotation.matrix) for part in asset.parts)), rotation
+    return replace(asset, parts=tuple(rotate_part(part, rotation.matrix) for part in asset.parts)), rotation
 
 
 def base_colours(asset: Asset) -> np.ndarray:
@@ -151,7 +151,7 @@ def in_gamut(colours: np.ndarray, matrix: np.ndarray) -> bool:
     return bool(rotated.min() >= -ROUNDING and rotated.max() <= 1 + ROUNDING)
 
 
-def rotated_part(part: Part, matrix: np.ndarray) -> Part:
+def rotate_part(part: Part, matrix: np.ndarray) -> Part:
     """The part with its base colours rotated; vertex colours take up the colour that they multiplied."""
     rotated = np.clip(part_colours(part) @ matrix.T, 0, 1)
     if part.colors is None:

@@ -41,7 +41,7 @@ class Listed:
 
 
 def describe_folder(folder: Path, most: int = 5) -> str:
-    """What a folder holds, for a message to somebody who expected something else."""
+    """What a folder holds, for error messages."""
     if not folder.is_dir():
         return "there is no such folder"
     names = sorted(path.name for path in folder.iterdir())

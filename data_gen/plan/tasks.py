@@ -230,7 +230,7 @@ def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
 
 
 def show_path(path: Path, root: Path) -> str:
-    """A file's path as it is reported: from the source's root, for where that lies is nobody's business."""
+    """A file's path as it is reported: relative to the source's root, so that no private path is published."""
     return path.relative_to(root).as_posix()
 
 

@@ -8,8 +8,8 @@ Conventions:
   axes          y up; `lathe` turns about y, `prism` and `loft` of sections may go anywhere
   creases       a corner's normal averages the neighbouring cells that turn away by less than `crease` degrees, so one
                 grid carries smooth and hard edges
-  texcoords     in units of length (arc length along the grid, or the plane of a cap): uniform density; whoever knows
-                the size of a texture divides
+  texcoords     in units of length (arc length along the grid, or the plane of a cap): uniform density; callers
+                divide by the texture's size
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Who draws objects in a comparison: trained networks and trivial renderers."""
+"""The methods of a comparison: trained networks and trivial renderers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -203,7 +203,7 @@ def score_objects(
                 result.scores[label] |= more(item, pictures)
         scores[name] = result.scores
         if name in to_show:
-            shown.append(shown_view(result))
+            shown.append(choose_view(result))
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
@@ -219,7 +219,7 @@ def time_views(method: Method, item: ObjectData, seconds: list[float]) -> evalua
     return measured
 
 
-def shown_view(result: evaluation.ObjectResult) -> Shown:
+def choose_view(result: evaluation.ObjectResult) -> Shown:
     """The view whose PSNR is the median of the first method's."""
     view = evaluation.median_view(next(iter(result.scores.values()))["psnr"])
     return Shown(

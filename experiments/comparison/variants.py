@@ -130,7 +130,7 @@ def measure_detail(item: data_sets.ObjectData, pictures: evaluation.Pictures) ->
 
 
 def notes(found: Mapping) -> list[str]:
-    """What a reader has to know of the numbers of a study."""
+    """Notes under the tables of a study."""
     counts = sorted({row["training_objects"] for row in found["methods"].values()})
     return [
         f"Budget: preset {found['preset']}, {found['steps']:,} steps each, {' or '.join(map(str, counts))} training "
@@ -190,7 +190,7 @@ def training_seconds(run: Path) -> float:
 
 
 def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: TrainConfig) -> dict[str, object]:
-    """What the numbers stand on."""
+    """Conditions of the measurement."""
     counts = {f"{split} objects": len(objects) for split, objects in dataset.splits.items()}
     return {
         "hardware": runtime.describe_hardware(),

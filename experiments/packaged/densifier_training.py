@@ -38,14 +38,17 @@ from spnr_jax.surfels.geometry import PointColumns, order_in_space
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
 TRUTH, VOTERS, EVEN = 2**17, 2**15, 2**12  # points of a surface, those that look for its sides, and even ones at most
-DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a child is compared with
-ASKED, NEAREST = 6, 6  # true points for each of a cloud that ask for a child, and the places near each
+DENSER, MATCHED = 48, 48  # true points for each of a cloud, and those that a learned point is compared with
+ASKED, NEAREST = 6, 6  # query points: true points for each of a cloud, and the places near each
 CORE, NODES, PLACES, QUERIES = 1024, 1920, 4864, 3072  # of a batch: points in its middle, sizes of its arrays
 FEWEST = 300  # points of a cloud
 OFTEN = 0.35, 0.25, 0.1, 0.2, 0.1  # how often each cloud of a record trains: sparse ones are harder
 UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
-EXACT, ROBUST = 0.08, 0.15  # spacings off the surface at which a child is half there, and errors begin to count less
+EXACT, ROBUST = (
+    0.08,
+    0.15,
+)  # spacings off the surface at which a learned point is half there, and errors begin to count less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +174,7 @@ def make_cloud(
 
 
 class Truth(NamedTuple):
-    """What children are compared with: true points near each place, and true points that ask for a child."""
+    """What learned points are compared with: true points near each place, and query points."""
 
     position: Any
     normal: Any
@@ -293,15 +296,15 @@ def join(parts: list[Batch]) -> Batch:
 
 
 def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
-    """(loss, metrics): children on the surface, true points near a child, existence, normals, colors."""
+    """(loss, metrics): learned points on the surface, true points near them, existence, normals, colors."""
     nodes, places, truth = batch.nodes, batch.places, batch.truth
-    children = predict(params, nodes, batch.neighbors, places)
-    shift = rotate(children.offset, places.frame)
+    learned = predict(params, nodes, batch.neighbors, places)
+    shift = rotate(learned.offset, places.frame)
     weight = places.exists * (HIDDEN + (1 - HIDDEN) * jnp.mean(truth.visible[:, :4].astype(jnp.float32), axis=1))
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
     way = (truth.position - places.middle[:, None]) / places.scale[:, None, None]
     normal = truth.normal.astype(jnp.float32)
-    seen, facing = jax.lax.stop_gradient((shift, children.normal))
+    seen, facing = jax.lax.stop_gradient((shift, learned.normal))
     squared = jnp.sum((way - seen[:, None]) ** 2, axis=-1)
     unlike = UNLIKE * (1 - jnp.einsum("mi,mti->mt", facing, normal)) + 0.2 * (1 - truth.visible)
     match = jnp.argmin(squared + unlike, axis=1)[:, None]
@@ -311,22 +314,22 @@ def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     beside = jnp.sqrt(jnp.sum((error - height[:, None] * at_goal) ** 2, axis=-1) + 1e-8)
     beyond = jax.nn.relu(beside - truth.floor)
     off = jnp.sqrt(height**2 + beyond**2 + 1e-4) - 0.01
-    cosine = jnp.sum(children.normal * at_goal, axis=-1)
-    likely = jax.nn.sigmoid(children.logit)
+    cosine = jnp.sum(learned.normal * at_goal, axis=-1)
+    likely = jax.nn.sigmoid(learned.logit)
     quality = jnp.exp(-0.5 * (off / EXACT) ** 2) * jnp.clip((cosine - 0.2) / 0.5, 0, 1)
     quality = jax.lax.stop_gradient(quality)
-    existence = optax.sigmoid_binary_cross_entropy(children.logit, quality)
+    existence = optax.sigmoid_binary_cross_entropy(learned.logit, quality)
     certain = jax.lax.stop_gradient(0.2 + 0.8 * likely) * weight
-    color = weigh_rows(children.weights, nodes.color[places.around])
+    color = weigh_rows(learned.weights, nodes.color[places.around])
     true_color = jnp.take_along_axis(truth.color, match[..., None], axis=1)[:, 0].astype(jnp.float32) / 255
     parts = {
-        "child": jnp.sum(certain * ROBUST * jnp.log1p(off / ROBUST)),
+        "learned": jnp.sum(certain * ROBUST * jnp.log1p(off / ROBUST)),
         "normal": jnp.sum(certain * (1 - cosine)),
         "existence": jnp.sum(weight * existence),
         "color": jnp.sum(certain * jnp.mean(jnp.abs(color - true_color), axis=-1)),
-        "cover": measure_cover(batch, children, likely),
+        "cover": measure_cover(batch, learned, likely),
     }
-    factors = {"child": 4.0, "normal": 0.6, "existence": 0.4, "color": 0.6, "cover": 1.5}
+    factors = {"learned": 4.0, "normal": 0.6, "existence": 0.4, "color": 0.6, "cover": 1.5}
     kept = weight * (likely > 0.5)
     share = jnp.sum(kept)
     metrics = parts | {"off": jnp.sum(kept * off) / share, "kept": share, "cosine": jnp.sum(kept * cosine) / share}
@@ -339,12 +342,12 @@ def measure_losses(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]
     return jax.tree.map(jnp.mean, jax.vmap(partial(measure_loss, params))(batch))
 
 
-def measure_cover(batch: Batch, children: Any, likely: Array) -> Array:
-    """Mean distance, in spacings, from true points to the nearest likely child or measured point that faces alike."""
+def measure_cover(batch: Batch, learned: Any, likely: Array) -> Array:
+    """Mean distance, in spacings, from true points to the nearest likely learned or measured point that faces alike."""
     truth, places, nodes = batch.truth, batch.places, batch.nodes
     scale = places.scale[jnp.maximum(truth.nearest[:, :1], 0)]
-    position = jnp.concatenate([children.position[truth.nearest], nodes.position[truth.parents]], axis=1)
-    normal = jnp.concatenate([children.normal[truth.nearest], nodes.normal[truth.parents]], axis=1)
+    position = jnp.concatenate([learned.position[truth.nearest], nodes.position[truth.parents]], axis=1)
+    normal = jnp.concatenate([learned.normal[truth.nearest], nodes.normal[truth.parents]], axis=1)
     real = jnp.concatenate([truth.nearest >= 0, truth.parents >= 0], axis=1)
     doubt = jnp.concatenate([1 - likely[truth.nearest], jnp.zeros(truth.parents.shape)], axis=1)
     squared = jnp.sum(((position - truth.asked[:, None]) / scale[..., None]) ** 2, axis=-1)

@@ -180,7 +180,7 @@ def _cost(cost: Mapping, column: str) -> Cell:
 
 
 def notes(results: Mapping) -> list[str]:
-    """What a reader has to know of the numbers: budget, data, machine, seed, how they were measured."""
+    """Notes under the table: budget, data, machine, seed, how they were measured."""
     counts, costs = next(iter(results["methods"].values())), results["costs"]
     presets = ", ".join(f"{LABELS[name]} {cost['preset']}" for name, cost in costs.items() if "preset" in cost)
     budget = f"Budget {results['budget']}: {BUDGETS[results['budget']]}."

@@ -7,8 +7,8 @@ from so many of each object's first points, beside the same discs and light with
 for, trimmed Poisson surfaces in Mitsuba (`--poisson`).  A ball of one grey should be smooth, a plate red in front
 should show no blue.  Two columns are an oracle: the same colours under the reference's opacity.
 
-    OUT/results.json  OUT/table.md     `scoring/picture_scores.py`, of each network and number of points
-    OUT/gallery.png   OUT/ID.png                 references and pictures beside each other, at full size
+    OUT/results.json  OUT/table.md     scores of `comparison/view_scores.py` for each network and number of points
+    OUT/gallery.png   OUT/ID.png       references and pictures beside each other, at full size
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ COLUMNS = {
     "inside_true_opacity": ("inside, true opacity", 2),
 }
 KNOWN_SIZE = 512  # pixels along each side of ball and plate
-COVERED = 0.3  # opacity from which on a picture's colour is told
+COVERED = 0.3  # opacity above which a pixel's colour is known
 WAVES = 8.0  # standard deviation of the Gaussian whose residue are waves
 GREY = 0.5  # base colour of the ball
 PLATE = (2.0, 1.4, 0.03)  # sides
