@@ -60,6 +60,7 @@ def cameras_of(
     return [_camera({**document, **frame}, number, turn, place) for number, frame in enumerate(frames)]
 
 
+@np.errstate(all="ignore")  # of numbers that leave float32, which are infinite then, and refused
 def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origin: np.ndarray) -> Camera:
     """One camera; in double precision until the origin is subtracted."""
     if entries.get("camera_model") in FISHEYE:
@@ -72,9 +73,10 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
     else:
         across = float(entries["fl_x"])
     down, cx, cy = (float(entries.get(*x)) for x in (("fl_y", across), ("cx", width / 2), ("cy", height / 2)))
-    intrinsics = np.array([[across, 0, cx], [0, down, cy], [0, 0, 1]])
+    intrinsics = np.array([[across, 0, cx], [0, down, cy], [0, 0, 1]], np.float32)
     matrix = np.asarray(entries["transform_matrix"], np.float64)
-    if matrix.shape not in ((4, 4), (3, 4)) or not (np.isfinite(matrix).all() and np.isfinite(intrinsics).all()):
+    finite = np.isfinite(matrix.astype(np.float32)).all() and np.isfinite(intrinsics).all()
+    if matrix.shape not in ((4, 4), (3, 4)) or not finite:
         raise UserError(f"a camera holds NaN or infinity, or is no 4 x 4 matrix (frame {number})")
     if not min(across, down) > 0:
         raise UserError(f"focal lengths {across:g} and {down:g} in frame {number}, expected positive ones")
@@ -82,9 +84,7 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
     if np.abs(turn @ turn.T - np.eye(3)).max() > WRONG or np.linalg.det(turn) < 0:
         raise UserError(f"the rotation of frame {number} is not orthonormal")
     pose = np.concatenate([rotation @ turn, (rotation @ (matrix[:3, 3] - origin))[:, None]], axis=1)
-    return Camera(
-        cam_to_world=pose.astype(np.float32), intrinsics=intrinsics.astype(np.float32), height=height, width=width
-    )
+    return Camera(cam_to_world=pose.astype(np.float32), intrinsics=intrinsics, height=height, width=width)
 
 
 def describe_cameras(cameras: Sequence[Camera], names: Sequence[str], rotation: np.ndarray, origin: np.ndarray) -> dict:

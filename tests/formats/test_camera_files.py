@@ -60,6 +60,8 @@ def test_an_angle_of_view_gives_the_focal_length_and_distortion_is_said(tmp_path
         (lambda d: d["frames"][1]["transform_matrix"].pop(), None),  # three rows suffice
         (lambda d: d["frames"][1]["transform_matrix"].clear(), "no 4 x 4 matrix (frame 1)"),
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "NaN or infinity"),
+        (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, 1e39), "NaN or infinity"),
+        (lambda d: d.update(fl_x=1e300), "NaN or infinity"),
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, 7.0), "frame 1 is not orthonormal"),
         (
             lambda d: [row.__setitem__(0, -row[0]) for row in d["frames"][0]["transform_matrix"]],
