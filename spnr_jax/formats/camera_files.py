@@ -78,7 +78,7 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
     finite = np.isfinite(matrix.astype(np.float32)).all() and np.isfinite(intrinsics).all()
     if matrix.shape not in ((4, 4), (3, 4)) or not finite:
         raise UserError(f"a camera holds NaN or infinity, or is no 4 x 4 matrix (frame {number})")
-    if not min(across, down) > 0:
+    if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
         raise UserError(f"focal lengths {across:g} and {down:g} in frame {number}, expected positive ones")
     turn = matrix[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > WRONG or np.linalg.det(turn) < 0:

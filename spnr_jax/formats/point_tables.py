@@ -15,6 +15,7 @@ import contextlib
 import io
 import re
 import threading
+import warnings
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
@@ -264,7 +265,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
     advice = "save arrays, as np.savez(file, points=..., colors=...)"
     broken = f"is a broken, truncated or pickled NumPy file: {advice}"
     try:
-        with refusing(broken), PARSER:
+        with _parsing(broken):
             rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     except MemoryError:  # of Python's parser: the header is nested too deeply
         raise UserError(broken) from None
@@ -290,6 +291,14 @@ def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
     return table.T
 
 
+@contextlib.contextmanager
+def _parsing(broken: str) -> Iterator[None]:
+    """NumPy reads a file: in one thread at a time, without warnings of old headers; UserError if it is broken."""
+    with refusing(broken), PARSER, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
     """An .npz archive of arrays by their names."""
     stream = io.BytesIO()
@@ -301,7 +310,7 @@ def read_arrays(
     file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
 ) -> dict[str, np.ndarray]:
     """The wanted arrays of an .npz archive, a line about others; ValueError if broken, or if it unpacks to too much."""
-    with refusing("is a broken or truncated NumPy file"), PARSER, np.load(file, allow_pickle=False) as archive:
+    with _parsing("is a broken or truncated NumPy file"), np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
         if (unpacked := sum(sizes[name] for name in names)) > MOST_BYTES:

@@ -62,6 +62,7 @@ def test_an_angle_of_view_gives_the_focal_length_and_distortion_is_said(tmp_path
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "NaN or infinity"),
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, 1e39), "NaN or infinity"),
         (lambda d: d.update(fl_x=1e300), "NaN or infinity"),
+        (lambda d: d.update(fl_y=1e-300), "expected positive ones"),
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, 7.0), "frame 1 is not orthonormal"),
         (
             lambda d: [row.__setitem__(0, -row[0]) for row in d["frames"][0]["transform_matrix"]],

@@ -490,3 +490,18 @@ def test_a_data_set_with_a_broken_row_is_refused():
     rows = [(0.0, 1.0, 0.0), (0.0, np.nan, 0.0), (np.inf, 0.0, 0.0)]
     with pytest.raises(ValueError, match="holds 2 points with NaN, infinity .* first point 1"):
         clouds.cloud_of_ply(ply_bytes(LITTLE, rows=rows, properties=XYZRGB[:3]))
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_a_header_that_python_2_wrote_is_read_without_a_warning(tmp_path, name, recwarn):
+    stream = io.BytesIO()
+    np.save(stream, BALL)
+    content = stream.getvalue().replace(b"(420, 3), }  ", b"(420L, 3L), }")
+    assert b"420L" in content
+    if name == "a.npy":
+        (tmp_path / name).write_bytes(content)
+    else:
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.writestr("points.npy", content)
+    np.testing.assert_allclose(read(tmp_path / name)[0].positions, BALL, atol=1e-6)
+    assert not recwarn.list
