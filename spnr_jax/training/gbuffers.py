@@ -41,7 +41,8 @@ from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, compose_picture
 from spnr_jax.surfels import lighting, normals
-from spnr_jax.training.batching import drop_materials, random_scan, read_ahead
+from spnr_jax.training.batching import read_ahead
+from spnr_jax.training.scan_faults import drop_materials, random_scan
 from spnr_jax.training.weights import add_companions
 
 CLOUDS = 2  # per object
