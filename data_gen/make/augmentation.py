@@ -78,6 +78,7 @@ def reshape_part(part: Part, reshaping: Reshaping) -> Part:
 
 
 MAX_DRAWS = 64
+TURNS = 24  # of the coarse grid that finds extreme colours
 LEAST_DEGREES = 30  # a smaller turn is hardly a variant, and the only kind that saturated colours have room for
 ROUNDING = 1e-6  # of a rotated float32 colour; what it exceeds the gamut by is clipped
 
@@ -136,9 +137,9 @@ def grey_rotation(degrees: float) -> np.ndarray:
     return np.cos(angle) * (np.eye(3) - along) + np.sin(angle) * across + along
 
 
-def extreme_colours(colours: np.ndarray, turns: int = 24) -> np.ndarray:
+def extreme_colours(colours: np.ndarray) -> np.ndarray:
     """The colours (m, 3) that some rotation of a coarse grid takes furthest up or down in a channel."""
-    rows = np.stack([grey_rotation(degrees)[0] for degrees in np.linspace(0, 360, turns, endpoint=False)])
+    rows = np.stack([grey_rotation(degrees)[0] for degrees in np.linspace(0, 360, TURNS, endpoint=False)])
     first = [
         np.array([values.argmin(), values.argmax()]) for values in (colours @ row.astype(colours.dtype) for row in rows)
     ]

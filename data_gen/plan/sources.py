@@ -28,6 +28,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.meshes import SUFFIXES
 
 NAMED_BY_FOLDER = (".gltf", ".obj")  # files that come with companions, so that the folder is the object
+NAMED = 5  # files that an error message names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +41,13 @@ class Listed:
     fault: str = ""
 
 
-def describe_folder(folder: Path, most: int = 5) -> str:
+def describe_folder(folder: Path) -> str:
     """What a folder holds, for error messages."""
     if not folder.is_dir():
         return "there is no such folder"
     names = sorted(path.name for path in folder.iterdir())
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"it holds {', '.join(names[:most])}{more}" if names else "it is empty"
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"it holds {', '.join(names[:NAMED])}{more}" if names else "it is empty"
 
 
 Category = Literal["car", "plane", "chair"]

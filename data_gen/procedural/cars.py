@@ -140,8 +140,8 @@ def cabin(rng, paint, glass, half, belt, high, foot, style) -> list[Piece]:
     base, top = half * 0.93, half * tumble
     corner = rng.uniform(0.02, 0.05)
 
-    def ring(wide, rear, front, y, shrink=0.0):
-        outline = rounded_rectangle(2 * (wide - shrink), front - rear - 2 * shrink, corner, 3)
+    def ring(wide, rear, front, y):
+        outline = rounded_rectangle(2 * wide, front - rear, corner, 3)
         return np.column_stack([outline[:, 0], np.full(len(outline), y), (rear + front) / 2 - outline[:, 1]])
 
     def at(t, grow=0.0):  # ring at a fraction of the height of the glass

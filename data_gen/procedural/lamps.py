@@ -52,8 +52,9 @@ def shade(rng, radius: float, height: float) -> tuple[Mesh, Mesh]:
     return loft(rings, closed=True), merge(spokes)
 
 
-def stem(rng, height: float, radius: float, thick=0.01) -> Mesh:
+def stem(rng, height: float, radius: float) -> Mesh:
     """A lamp's body from y = 0 to height: vase, gourd, stack of balls, turned post, column or block."""
+    thick = 0.01  # of the rod
     style = rng.choice(["vase", "stack", "turned", "column", "block", "twist"])
     neck = rng.uniform(0.8, 0.95)
     if style in ("vase", "turned"):

@@ -23,11 +23,12 @@ from data_gen.shapes.primitives import (
 )
 
 
-def fuselage(z, width, height, middle, segments=28) -> Mesh:
+def fuselage(z, width, height, middle) -> Mesh:
     """Loft of ellipses (width, height) at z (n,), centred on height `middle`.
 
     Texture coordinates: u around from the belly, v from 0 at the nose to 1 at the tail.
     """
+    segments = 28
     around = np.roll(circle(segments), segments // 4, axis=0)
     x, y = width[:, None] / 2 * around[:, 0], middle[:, None] + height[:, None] / 2 * around[:, 1]
     rings = np.stack([x, y, np.broadcast_to(z[:, None], (len(z), segments))], axis=-1)
@@ -58,12 +59,12 @@ def livery(rng) -> finishes.Finish:
     return finishes.Finish(finishes.material(picture, rng.uniform(0.15, 0.5), 0.0))
 
 
-def windows(picture_finish, rows=(0.44,), start=0.12, end=0.8, count=40) -> finishes.Finish:
+def windows(picture_finish, rows, count) -> finishes.Finish:
     """The finish with a line of dark windows at each share of the way from back (0) to belly (1), on both sides."""
     u, v = patterns.grid()
     side = np.abs(u - 0.5) * 2
     cell = (v * count) % 1
-    column = patterns.step(0.25 - np.abs(cell - 0.5), 0.0, 0.1) * (v > start) * (v < end)
+    column = patterns.step(0.25 - np.abs(cell - 0.5), 0.0, 0.1) * (v > 0.12) * (v < 0.8)
     weight = sum(column * patterns.step(0.022 - np.abs(side - row), 0.0, 0.01) for row in rows)
     old = picture_finish.material
     picture = patterns.mix(old.base_color, np.full(3, 0.03), np.clip(weight, 0, 1))

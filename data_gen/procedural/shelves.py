@@ -28,7 +28,7 @@ def bookcase(rng) -> list[Piece]:
     pieces = [(body, merge([carcass(width, height, depth, board), *boards]))]
     if rng.random() < 0.7:
         pieces.append((back, move(box((width - board, height - board, 0.008)), y=height / 2, z=-depth / 2 + 0.006)))
-    books = finishes.swatches(rng, 12)
+    books = finishes.swatches(rng)
     parts = rng.integers(1, 3) if width > 0.8 else 1
     for low, high in zip(levels[:-1], levels[1:], strict=True):
         if parts == 2:
@@ -80,10 +80,11 @@ def contents(rng, books, room, height, depth) -> list[Piece]:
 
 
 def on_swatch(rng, mesh: Mesh) -> Mesh:
-    """The mesh in one of the 12 plain colours of `finishes.swatches`, its lines across the mesh's height."""
+    """The mesh in one of the plain colours of `finishes.swatches`, its lines across the mesh's height."""
     y = mesh.positions[:, 1]
     v = 0.05 + 0.9 * (y - y.min()) / np.ptp(y)
-    return mesh._replace(texcoords=np.column_stack([np.full(len(y), (rng.integers(12) + 0.5) / 12), v]))
+    u = (rng.integers(finishes.SWATCHES) + 0.5) / finishes.SWATCHES
+    return mesh._replace(texcoords=np.column_stack([np.full(len(y), u), v]))
 
 
 def row_of_books(rng, room, height, depth) -> Mesh:
@@ -116,7 +117,7 @@ def cube_grid(rng) -> list[Piece]:
     boards = [move(box((width, board, depth * 0.97)), y=i * cell + board / 2) for i in range(1, rows)]
     pieces = [(body, merge([carcass(width, height, depth, board), *uprights, *boards]))]
     pieces.append((body, move(box((width - board, height - board, 0.008)), y=height / 2, z=-depth / 2 + 0.006)))
-    books = finishes.swatches(rng, 12)
+    books = finishes.swatches(rng)
     for i in range(columns):
         for j in range(rows):
             x, y, room = (i + 0.5) * cell - columns * cell / 2, j * cell + board, cell - board
@@ -144,7 +145,7 @@ def ladder(rng) -> list[Piece]:
             for z in (depth / 2, -depth / 2)
         ]
         meshes += [tube(np.array(pair), rail, section=square) for pair in ends]
-    books, pieces = finishes.swatches(rng, 12), []
+    books, pieces = finishes.swatches(rng), []
     for level in np.linspace(0.08, 0.97, count):
         deep = depth * (1 + (narrow - 1) * level)
         pieces.append((top, move(box((width, 0.022, deep), 0.003), y=level * height, z=(deep - depth) / 2)))
@@ -175,7 +176,7 @@ def rack(rng) -> list[Piece]:
             braces.append(tube(ends, post * 0.35, segments=6))
     pieces = [(body, merge([*posts, *beams, *braces]))]
     pieces += [(top, move(box((width, 0.018, depth)), y=y)) for y in levels]
-    boxes, books = finishes.choose(rng, finishes.paint, finishes.print_, finishes.rattan), finishes.swatches(rng, 12)
+    boxes, books = finishes.choose(rng, finishes.paint, finishes.print_, finishes.rattan), finishes.swatches(rng)
     room = height / count * 0.75
     for y in levels[:-1]:
         x = -width / 2 + 0.05

@@ -187,12 +187,14 @@ def canvas(rng) -> Finish:
     return Finish(material(picture, rng.uniform(0.3, 0.9)))
 
 
-def swatches(rng, count: int) -> Finish:
-    """Many plain colours in one material: colour k lies at u = (k + 0.5) / count; with lines across, as book spines."""
-    colors = np.stack([color(rng) for _ in range(count)])
-    width = max(8, 128 // count)
+SWATCHES = 12
+
+
+def swatches(rng) -> Finish:
+    """Plain colours in one material, colour k at u = (k + 0.5) / SWATCHES; with lines across, as book spines."""
+    colors = np.stack([color(rng) for _ in range(SWATCHES)])
     lines = patterns.step(np.abs((np.arange(64) + 0.5) / 64 - 0.5), rng.uniform(0.3, 0.4), 0.02)
     lines *= 1 - patterns.step(np.abs((np.arange(64) + 0.5) / 64 - 0.5), rng.uniform(0.42, 0.46), 0.02)
-    marks = np.stack([color(rng) for _ in range(count)])
-    picture = colors + lines[:, None, None] * rng.uniform(0, 0.8, (count, 1)) * (marks - colors)
-    return Finish(material(np.repeat(picture, width, axis=1), rng.uniform(0.3, 0.8)))
+    marks = np.stack([color(rng) for _ in range(SWATCHES)])
+    picture = colors + lines[:, None, None] * rng.uniform(0, 0.8, (SWATCHES, 1)) * (marks - colors)
+    return Finish(material(np.repeat(picture, 128 // SWATCHES, axis=1), rng.uniform(0.3, 0.8)))

@@ -10,22 +10,22 @@ import numpy as np
 SIZE = 192
 
 
-def grid(size=SIZE) -> tuple[np.ndarray, np.ndarray]:
-    """(u (1, size), v (size, 1)) at texel centres, in [0, 1]."""
-    place = (np.arange(size) + 0.5) / size
+def grid() -> tuple[np.ndarray, np.ndarray]:
+    """(u (1, SIZE), v (SIZE, 1)) at texel centres, in [0, 1]."""
+    place = (np.arange(SIZE) + 0.5) / SIZE
     return place[None, :], place[:, None]
 
 
-def noise(rng, frequency=(4.0, 4.0), slope=2.0, size=SIZE) -> np.ndarray:
-    """(size, size) smooth noise about 0.5 of spread about 1/6, of some `frequency` (along u, along v) in waves a tile.
+def noise(rng, frequency=(4.0, 4.0), slope=2.0) -> np.ndarray:
+    """(SIZE, SIZE) smooth noise about 0.5 of spread about 1/6, of some `frequency` (along u, along v) in waves a tile.
 
     White noise filtered to (1 + |f/frequency|^2)^(-slope): periodic, because its spectrum is the discrete one.
     """
-    along_u = np.fft.rfftfreq(size, 1 / size)[None, :] / frequency[0]
-    along_v = np.fft.fftfreq(size, 1 / size)[:, None] / frequency[1]
-    spectrum = np.fft.rfft2(rng.uniform(-1, 1, (size, size))) * (1 + along_u**2 + along_v**2) ** -slope
+    along_u = np.fft.rfftfreq(SIZE, 1 / SIZE)[None, :] / frequency[0]
+    along_v = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None] / frequency[1]
+    spectrum = np.fft.rfft2(rng.uniform(-1, 1, (SIZE, SIZE))) * (1 + along_u**2 + along_v**2) ** -slope
     spectrum[0, 0] = 0
-    field = np.fft.irfft2(spectrum, (size, size))
+    field = np.fft.irfft2(spectrum, (SIZE, SIZE))
     return np.clip(0.5 + field / (6 * field.std()), 0, 1)
 
 

@@ -50,10 +50,10 @@ def curve(points, samples=16) -> np.ndarray:
     return 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
 
 
-def bent_line(points, radius: float, steps=6) -> np.ndarray:
+def bent_line(points, radius: float) -> np.ndarray:
     """(k, 3) straight runs through points (n, 3), each inner corner rounded over `radius` before and after it."""
     points = np.asarray(points, float)
-    path, t = [points[:1]], np.linspace(0, 1, steps + 1)[:, None]
+    path, t = [points[:1]], np.linspace(0, 1, 7)[:, None]
     for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
         back, ahead = before - corner, after - corner
         back, ahead = (arm * min(radius / np.linalg.norm(arm), 0.49) for arm in (back, ahead))
@@ -181,11 +181,11 @@ def cap(ring, *, top: bool) -> Mesh:
     return _without_slivers(Mesh(positions, faces, normals, positions[:, plane]))
 
 
-def loft(rings, *, closed=False, caps=True, crease=CREASE) -> Mesh:
+def loft(rings, *, closed=False, crease=CREASE) -> Mesh:
     """Surface through rings (r, c, 3), each a closed loop; with lids on both ends, or closed end to end."""
     rings = np.asarray(rings, float)
     side = patch(rings, wrap_columns=True, wrap_rows=closed, crease=crease)
-    if closed or not caps:
+    if closed:
         return side
     return merge([side, cap(rings[0], top=False), cap(rings[-1], top=True)])
 
@@ -259,12 +259,11 @@ def cylinder(radius: float, height: float, segments=24, bevel=0.0) -> Mesh:
     return lathe([(inner, 0), (radius, bevel), (radius, height - bevel), (inner, height)], segments)
 
 
-def tube(path, radius, *, segments=10, section=None, closed=False, crease=CREASE) -> Mesh:
+def tube(path, radius, *, segments=10, section=None) -> Mesh:
     """Circle (or `section` (k, 2)) of a radius () or (n,) swept along a path (n, 3) without twist."""
     path = np.asarray(path, float)
     section = circle(segments) if section is None else np.asarray(section, float)
-    ends = (np.roll(path, -1, axis=0), np.roll(path, 1, axis=0))
-    tangent = ends[0] - ends[1] if closed else np.gradient(path, axis=0)
+    tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.eye(3)[int(np.argmin(np.abs(tangent).max(axis=0)))]
     rings = np.empty((len(path), len(section), 3))
@@ -273,7 +272,7 @@ def tube(path, radius, *, segments=10, section=None, closed=False, crease=CREASE
         side = side - forward * (side @ forward)
         side = side / np.linalg.norm(side)
         rings[i] = path[i] + scale[i] * (section @ np.stack([side, cross(forward, side)]))
-    return loft(rings, closed=closed, crease=crease)
+    return loft(rings)
 
 
 def superellipsoid(size, vertical=0.4, around=0.4, rows=12, segments=24) -> Mesh:

@@ -11,7 +11,7 @@ from experiments.comparison.study_objects import each_view
 from spnr_jax.config import Quality, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
-from spnr_jax.kernels.records import Light, Volume
+from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import METHODS, method_of
 from spnr_jax.scoring import evaluation
@@ -27,16 +27,12 @@ LABELS = {  # method -> its name in tables and pictures, in their order
 }
 
 
-def nothing(_: ObjectData) -> None:
-    """What is done once for an object by who draws it from its points alone."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Method:
     """Draws all views of an object from what `encode` makes of it once."""
 
     draw: Callable[[Any, ObjectData], Pictures]
-    encode: Callable[[ObjectData], Any] = nothing
+    encode: Callable[[ObjectData], Any] = lambda _: None
     compiles: bool = False
     """Whether its first call is slower than those after it."""
     has_opacity: bool = True
@@ -67,11 +63,9 @@ def of_model(model: Model, quality: Quality = "best") -> Method:
     )
 
 
-def draw_volume(
-    model: Model, volume: Volume, item: ObjectData, quality: Quality = "best", lights: list[Light] | None = None
-) -> Pictures:
-    """The views of an object whose volume there is, in its own lights where none are given."""
-    found = list(model.render_each(volume, each_view(item), quality, lights or item.own_lights))
+def draw_volume(model: Model, volume: Volume, item: ObjectData, quality: Quality = "best") -> Pictures:
+    """The views of an object whose volume there is, each in its own light, where it has one."""
+    found = list(model.render_each(volume, each_view(item), quality, item.own_lights))
     image, acc, depth = (np.stack([np.asarray(getattr(one, x)) for one in found]) for x in ("image", "acc", "depth"))
     return Pictures(image=image, acc=acc, depth=depth)
 
@@ -87,7 +81,7 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
     return found
 
 
-def of_floor(name: str, factor: float = 1.0) -> Method:
+def of_floor(name: str, factor: float) -> Method:
     """A trivial renderer with the radius of its points, in point spacings."""
     show = evaluation.make_floor(name, factor)
     return Method(

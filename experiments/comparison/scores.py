@@ -124,10 +124,7 @@ def mean_scores(scores: Mapping[str, Sequence[float]]) -> dict[str, float | None
 
 
 def score_row(
-    label: str,
-    objects: Sequence[Mapping[str, Any]],
-    columns: Mapping[str, tuple[str, int]] = COLUMNS,
-    sign: str = "",
+    label: str, objects: Sequence[Mapping[str, Any]], columns: Mapping[str, tuple[str, int]] = COLUMNS
 ) -> tuple[str, tuple[Cell, ...]]:
     """A row of means over objects with intervals; None and NaN are left out."""
     cells = []
@@ -135,7 +132,7 @@ def score_row(
         values = np.array([of.get(name) for of in objects], float)
         known = values[~np.isnan(values)]
         mean, ends = (float(known.mean()), interval([x[None] for x in known])) if len(known) else (None, None)
-        cells.append(number(mean, decimals, ends, sign=sign))
+        cells.append(number(mean, decimals, ends))
     return label, tuple(cells)
 
 

@@ -41,7 +41,7 @@ def measure_sharpness(
         psnr_inside=_decibels(squared[alpha > 0.999]),
         outline_rmse=mean((opacity - alpha)[outline] ** 2) ** 0.5,
         holes=100 * mean(opacity[deep] < SOLID),
-        detail=_correlation(_residue(image, DETAIL)[deep], _residue(white, DETAIL)[deep]),
+        detail=_correlation(_residue(image)[deep], _residue(white)[deep]),
     )
 
 
@@ -60,10 +60,10 @@ def _decibels(squared: np.ndarray) -> float:
     return float(min(-10 * np.log10(error), 100.0)) if error > 0 else (100.0 if error == 0 else error)
 
 
-def _residue(image: np.ndarray, sigma: float) -> np.ndarray:
+def _residue(image: np.ndarray) -> np.ndarray:
     """Difference between the mean of the colours and its Gaussian blur."""
     grey = image.mean(axis=-1)
-    return grey - gaussian_filter(grey, sigma)
+    return grey - gaussian_filter(grey, DETAIL)
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:

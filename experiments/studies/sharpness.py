@@ -165,9 +165,9 @@ def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     }
 
 
-def ball(count: int, seed: int = 0) -> PointCloud:
+def ball(count: int) -> PointCloud:
     """Random points of a grey ball: its picture should be smooth."""
-    towards = np.random.default_rng(seed).standard_normal((count, 3))
+    towards = np.random.default_rng(0).standard_normal((count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     return make_cloud(towards, GREY, roughness=0.5, normals=towards)
 
@@ -179,9 +179,9 @@ def ball_waves(image: Float[np.ndarray, "height width 3"], opacity: Float[np.nda
     return float(np.mean((grey - gaussian_filter(grey, WAVES))[inside] ** 2) ** 0.5) if inside.any() else float("nan")
 
 
-def plate(count: int, seed: int = 0) -> PointCloud:
+def plate(count: int) -> PointCloud:
     """Random points of a thin plate, red in front (+z) and blue behind and at the rims."""
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     width, height, depth = PLATE
     areas = np.array([width * height] * 2 + [width * depth] * 2 + [height * depth] * 2)
     side = generator.choice(6, count, p=areas / areas.sum())

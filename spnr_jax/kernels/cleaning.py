@@ -214,14 +214,13 @@ def _measure_heights(near: np.ndarray) -> np.ndarray:
 
 
 def denoise(
-    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float, deviations: float = RADIUS
+    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float
 ) -> tuple[Float[np.ndarray, "moved 3"], Values]:
     """Points moved to remove noise of this standard deviation, at most MOST_MOVED, and the local means of their values.
 
-    The radius of a neighbour's weight is `deviations` times the noise; the same rows come back for each
-    radius.  Normals keep unit length, or are 0 where they contradict each other.
+    Normals keep unit length, or are 0 where they contradict each other.
     """
-    radius = max(deviations * sigma, LEAST_RADIUS * spacing)
+    radius = max(RADIUS * sigma, LEAST_RADIUS * spacing)
     order = np.lexsort(positions.T)  # a part is then spread over the cloud, and independent of the order of the points
     within = 2 * np.pi * (radius / spacing) ** 2  # points whose weight counts
     basis, rows = order[:: max(1, int(within / AROUND))], order[:: -(-len(order) // MOST_MOVED)]

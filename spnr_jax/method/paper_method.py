@@ -34,6 +34,7 @@ from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsampler
 
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples per ray in training
+REACH_QUERIES = 4096  # points at which the spacing is measured
 REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
 CELLS_PER_VOXEL = 1  # along an axis: cells of the path of a ray through the box
 RAY_BLOCK = 256  # rays near points that are rendered at once
@@ -301,7 +302,7 @@ def discriminator(config: TrainConfig) -> Discriminator:
     return Discriminator(config.loss.discriminator_width, config.model.encoder.num_groups, config.model.bf16)
 
 
-def estimate_reach(positions: np.ndarray, resolution: int, num_queries: int = 4096) -> int:
+def estimate_reach(positions: np.ndarray, resolution: int) -> int:
     """Distance from points, in voxels, within which the surface lies; from the median distance to the nearest neighbor.
 
     Duplicates of a point (closer than 1/1024 of the box) count once.
@@ -311,7 +312,7 @@ def estimate_reach(positions: np.ndarray, resolution: int, num_queries: int = 40
     positions = positions[distinct]
     if len(positions) < 2:
         return LARGEST_REACH
-    queries = positions[:: -(-len(positions) // num_queries)]
+    queries = positions[:: -(-len(positions) // REACH_QUERIES)]
     distances, _ = cKDTree(positions).query(queries, 2)
     spacing = np.median(distances[:, 1]) * resolution / 2
     return int(np.clip(np.ceil(REACH_PER_SPACING * spacing), 1, LARGEST_REACH))

@@ -37,6 +37,7 @@ from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, me
 from spnr_jax.training.weights import Trained, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
+RADIUS_OBJECTS = 8  # training objects on which one of them is chosen
 FLOORS = ("white", "splat", "nearest")
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB
 
@@ -97,9 +98,9 @@ def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, 
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
-def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str, num_objects: int = 8) -> float:
+def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) -> float:
     """The radius factor with the highest PSNR over a few training objects."""
-    items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:num_objects]]
+    items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:RADIUS_OBJECTS]]
     if not items:
         raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 

@@ -65,17 +65,16 @@ def number(
     interval: Sequence[Any] | None = None,
     *,
     sign: str = "",
-    factor: float | int = 1,
     missing: str = "n/a",
     best: bool = False,
     more: tuple[str, ...] = (),
 ) -> Cell:
-    """A number (times a factor) and its interval; `sign` is "+" for differences, `more` follows the interval."""
+    """A number and its interval; `sign` is "+" for differences, `more` follows the interval."""
     if value is None or not math.isfinite(value):
         return Cell(missing)
     form = f"{sign},.{decimals}f"
-    ends = [f"[{', '.join(f'{factor * end:{form}}' for end in interval)}]"] if interval else []
-    return Cell(f"{factor * value:{form}}", (*ends, *more), best)
+    ends = [f"[{', '.join(f'{end:{form}}' for end in interval)}]"] if interval else []
+    return Cell(f"{value:{form}}", (*ends, *more), best)
 
 
 def head(metric: str) -> str:

@@ -97,16 +97,16 @@ class SurfacePoints(NamedTuple):
     normal: Float[np.ndarray, "pixels 3"]
 
 
-def collect_surface(views: Sequence[View], surfels: Surfels, stride: int = STRIDE) -> SurfacePoints:
+def collect_surface(views: Sequence[View], surfels: Surfels) -> SurfacePoints:
     """The surface points that the views show; ValueError if they show none."""
     found, rays = [], []
     for i, view in enumerate(views):
-        row, column = i % stride, i // stride % stride  # each view uses other pixels
+        row, column = i % STRIDE, i // STRIDE % STRIDE  # each view uses other pixels
         of = camera_rays(view.camera)
-        depth = view.depth[row::stride, column::stride]
+        depth = view.depth[row::STRIDE, column::STRIDE]
         hit = np.isfinite(depth)
-        direction = np.asarray(of.directions)[row::stride, column::stride][hit]
-        origin = np.asarray(of.origins)[row::stride, column::stride][hit]
+        direction = np.asarray(of.directions)[row::STRIDE, column::STRIDE][hit]
+        origin = np.asarray(of.origins)[row::STRIDE, column::STRIDE][hit]
         found.append((origin + depth[hit][:, None] * direction).astype(np.float32))
         rays.append(direction)
     position, direction = np.concatenate(found), np.concatenate(rays)

@@ -34,6 +34,7 @@ from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
+PREVIEWED = 6  # objects of a preview
 GOES_ON = "the same command goes on from there"
 
 
@@ -171,10 +172,9 @@ def preview(
     dataset: data_sets.Dataset,
     run: Path,
     light: Light | None = None,
-    num_objects: int = 6,
 ) -> tuple[dict[str, float], np.ndarray]:
     """Validation PSNR of the averaged network on a few objects, and the preview (references above renderings)."""
-    names = (dataset.splits["val"] or dataset.splits["train"])[:num_objects]
+    names = (dataset.splits["val"] or dataset.splits["train"])[:PREVIEWED]
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
     columns, scores = [], []

@@ -79,7 +79,8 @@ def test_a_summary_is_the_mean_over_all_images_with_its_counts(outcome, results)
 def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch):
     real, asked = data_sets.read_object, []
     monkeypatch.setattr(data_sets, "read_object", lambda dataset, name: asked.append(name) or real(dataset, name))
-    chosen = evaluation.choose_radius(tiny_dataset.dataset(), CONFIG, "splat", num_objects=2)
+    monkeypatch.setattr(evaluation, "RADIUS_OBJECTS", 2)
+    chosen = evaluation.choose_radius(tiny_dataset.dataset(), CONFIG, "splat")
     assert set(asked) == set(tiny_dataset.SPLITS["train"][:2])
     items = [real(tiny_dataset.dataset(), name) for name in tiny_dataset.SPLITS["train"][:2]]
 

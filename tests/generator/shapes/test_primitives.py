@@ -18,7 +18,6 @@ CLOSED = {
     "ring": lambda: primitives.lathe([(1, 0), (1.2, 0), (1.2, 0.3), (1, 0.3)], closed=True),
     "cylinder": lambda: primitives.cylinder(0.4, 2.0, 16, 0.05),
     "tube": lambda: primitives.tube(BENT, 0.1),
-    "hoop": lambda: primitives.tube(np.column_stack([circle(20), np.zeros(20)]), 0.1, closed=True),
     "superellipsoid": lambda: primitives.superellipsoid((1, 2, 3), 0.4, 0.3),
     "shell": lambda: primitives.shell(SHEET + [0, 0, 0.1] * SHEET[..., :1] ** 2, 0.1),
     "moulding": lambda: primitives.moulding(1.0, 0.7, [(0, 0), (0.1, 0), (0.1, 0.02), (0, 0.05)]),
