@@ -37,7 +37,7 @@ from spnr_jax.surfels.sides import DIRECTIONS
 # --- inputs -----------------------------------------------------------------------------------------------------------
 
 
-NUM_FEATURES, NUM_MAPS = 33, 17
+NUM_FEATURES = 33
 ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity at which a pixel's features have half their value
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared

@@ -19,11 +19,11 @@ from support.surfel_clouds import surfels
 from spnr_jax.kernels import numerics
 from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import NUM_MAPS
 from spnr_jax.surfels import discs, layers, lighting, splatting
 from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS
 
 POINTS = 16
+NUM_MAPS = 17  # of a pixel, for the shader
 
 
 def columns(vectors):

@@ -7,11 +7,11 @@ from support.laws import close, numbers
 
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import COLOR_STEP, LOGIT_MARGIN, LOGIT_STEP, NOTHING, NUM_MAPS, NUM_OUTPUTS
+from spnr_jax.nn.shader import COLOR_STEP, LOGIT_MARGIN, LOGIT_STEP, NOTHING, NUM_OUTPUTS
 from spnr_jax.surfels.lighting import SPECULAR
 
 picture = jax.jit(shader.compose_picture, static_argnums=3)
-LIT = slice(7, 16)  # maps that are linear in the light
+NUM_MAPS, LIT = 17, slice(7, 16)  # maps of a pixel; those that are linear in the light
 
 
 def maps(seed=0, size=6):
