@@ -167,10 +167,8 @@ def place_candidates(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Candidates:
     turned = turned | ((nodes.spacing[first] == nodes.spacing[second]) & (first > second))
     first, second = jnp.where(turned, second, first), jnp.where(turned, first, second)
     is_open = (first == second)[:, None]
-    direction, scale = (
-        nodes.position[second] - nodes.position[first],
-        (nodes.spacing[first] + nodes.spacing[second]) / 2,
-    )
+    direction = nodes.position[second] - nodes.position[first]
+    scale = (nodes.spacing[first] + nodes.spacing[second]) / 2
     one, two = nodes.normal[first], nodes.normal[second]
     heights = jnp.sum(direction * one, axis=1, keepdims=True), -jnp.sum(direction * two, axis=1, keepdims=True)
     curved = direction / 2 - (heights[0] * one + heights[1] * two) / 8

@@ -189,10 +189,8 @@ LEAST_FACING = 0.05  # weight of a splat that is seen edge-on
 RIDGE = 0.4  # of the higher degrees; its unit is one view
 BEFORE = 2.5  # sides of a cube in front of a picture's depth beyond which the view contradicts a splat
 EMPTY = 0.5  # opacity below which a picture is empty
-TOLERATED_SHARE, TOLERATED = (
-    0.12,
-    0.5,
-)  # contradicting views that are tolerated: share of the views that see the splat, plus a number
+TOLERATED_SHARE = 0.12  # contradicting views that are tolerated: this share of the views that see the splat,
+TOLERATED = 0.5  # plus this number
 
 
 def color_splats(gaussians: Gaussians, views: Sequence[View], *, side: float, degree: int) -> Gaussians:

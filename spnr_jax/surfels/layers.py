@@ -372,14 +372,10 @@ def _test_split(
     step, own = fit.step, fit.weight
     last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
     error = jnp.maximum(solve(fit.sums + _ridge(step.dtype), last)[-1, 0], 1e-9)
-    total_weight, other_weight, squares = (
-        sum_first(own),
-        sum_first(own * color_distance),
-        sum_first(own * color_distance**2),
-    )
-    step_alone = jnp.maximum(
-        squares - other_weight**2 / jnp.maximum(total_weight, 1e-9), 1e-9
-    )  # if the step were the only unknown
+    total_weight, other_weight = sum_first(own), sum_first(own * color_distance)
+    squares = sum_first(own * color_distance**2)
+    # the information about the step if it were the only unknown
+    step_alone = jnp.maximum(squares - other_weight**2 / jnp.maximum(total_weight, 1e-9), 1e-9)
     high = jnp.abs(step) / fit.layer.thickness
     independence = 1 / (step_alone * error)
     smaller_weight = _smaller_weight(total_weight, other_weight)

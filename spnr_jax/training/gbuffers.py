@@ -59,11 +59,9 @@ MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel
 SIZES = (96, 72, 48, 48, 32)  # pixels along a crop, by doublings; scaled if config.crop is not the first
 MARGINS = (0, 4, 8, 14, 10)  # pixels on each side of a crop that are input but not output, by doublings
 SHARES = (0.3, 0.22, 0.22, 0.2, 0.06)  # of the steps, by doublings
-TRIES, LEAST_COVERED, VISIBLE_OPACITY = (
-    4,
-    0.15,
-    0.02,
-)  # positions tried for a crop, until so large a share of it has this opacity
+TRIES = 4  # positions that are tried for a crop
+LEAST_COVERED = 0.15  # share of a crop's pixels that show the object, with which no other position is tried
+VISIBLE_OPACITY = 0.02  # opacity above which a pixel shows the object
 LARGEST_FLOAT16 = 6e4  # largest value in float16; brighter light does not make a picture brighter than white
 LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it is 0
 CLOUD_STREAM, CROP_STREAM = 3, 4  # random streams under one seed, in addition to those of `batching`
