@@ -24,7 +24,6 @@ from spnr_jax.errors import UserError, require
 
 Quality = Literal["draft", "balanced", "best", "trained"]
 Material = Literal["base_color", "roughness", "metallic"]
-MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
 LARGEST = 2**63  # of any number in a config
 
@@ -146,8 +145,6 @@ class NetworkConfig:
     """Whether its loss may be adversarial."""
     crops: ClassVar[bool] = False
     """Whether it is trained on crops of views."""
-    ray_block: ClassVar[int | None] = None
-    """Default number of rays rendered at once; None: the network's own."""
 
     image_resolution: int = 128
     """Pixels along each side of a training picture."""
@@ -178,7 +175,6 @@ class PaperConfig(NetworkConfig):
     method: ClassVar[str] = "paper"
     qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft", "trained")
     has_discriminator: ClassVar[bool] = True
-    ray_block: ClassVar[int | None] = 1024  # through all the box at once: about 80 MB at 128 samples
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

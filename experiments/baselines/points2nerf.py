@@ -277,7 +277,7 @@ class Points2NeRF(nn.Module):
 
     def whole(self, weights: Weights, camera: Camera, key: Key | None) -> Rendering:
         """Views of encoded objects, all rays at once; a key jitters the samples (training)."""
-        return cameras.as_images(camera, *self.render_rays(weights, self.rays(camera), key))
+        return ray_chunks.as_images(camera, *self.render_rays(weights, self.rays(camera), key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""

@@ -5,15 +5,27 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera, Rendering
 
 
 def render(module: Any, scene: Any, camera: Camera, chunk: int) -> Rendering:
     """Views of encoded objects by a bound module with `rays` and `render_rays`, `chunk` rays of each object at once."""
     network, variables = module.unbind()
-    return cameras.as_images(camera, *_in_chunks(network, chunk, variables, scene, module.rays(camera)))
+    return as_images(camera, *_in_chunks(network, chunk, variables, scene, module.rays(camera)))
+
+
+def as_images(
+    camera: Camera,
+    rgb: Float[Array, "objects rays 3"],
+    depth: Float[Array, "objects rays"],
+    acc: Float[Array, "objects rays"],
+) -> Rendering:
+    """Views from the rays of `cameras.view_rays`, by a method that renders every pixel of the image."""
+    shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
+    image = rgb.reshape(*shape, 3)
+    return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
 
 
 def _in_chunks(module: nn.Module, chunk: int, variables: dict, scene: Any, rays: Any) -> Any:

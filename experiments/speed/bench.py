@@ -143,6 +143,10 @@ def our_batch(config: TrainConfig) -> Batch:
     return jax.device_put(make_batch(found))
 
 
+jitted_encode = jax.jit(inference.encode, static_argnames="config")
+jitted_render = jax.jit(inference.render, static_argnames="config")
+
+
 def our_side(preset: str, mode: Mode) -> tuple[Run, float]:
     """What to time, and the seconds that its compilation took."""
     config = our_config(preset, mode, BATCHES[preset])
@@ -164,10 +168,10 @@ def function(config: TrainConfig, batch: Batch, mode: Mode) -> Run:
 
         return step
     variables, cloud = optimisation.averaged_variables(state), batch.cloud
-    encode = partial(inference.jitted_encode, variables, cloud, config=config.model)
+    encode = partial(jitted_encode, variables, cloud, config=config.model)
     if mode == "encode":
         return lambda: jax.block_until_ready(encode())
-    draw = partial(inference.jitted_render, variables, encode(), batch.camera, config=config.model)
+    draw = partial(jitted_render, variables, encode(), batch.camera, config=config.model)
     return lambda: jax.block_until_ready(draw())
 
 

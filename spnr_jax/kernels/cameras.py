@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import length, normalize, safe_divide
-from spnr_jax.kernels.records import AnyArray, Camera, Rays, Rendering
+from spnr_jax.kernels.records import AnyArray, Camera, Rays
 
 # A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
 # square of its inverse, which the gradient contains, stays far from overflow.
@@ -59,18 +59,6 @@ def camera_rays(camera: Camera) -> Rays:
 def view_rays(camera: Camera) -> Rays:
     """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), camera_rays(camera))
-
-
-def as_images(
-    camera: Camera,
-    rgb: Float[Array, "objects rays 3"],
-    depth: Float[Array, "objects rays"],
-    acc: Float[Array, "objects rays"],
-) -> Rendering:
-    """Views from the rays of `view_rays`, by a method that renders every pixel of the image."""
-    shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
-    image = rgb.reshape(*shape, 3)
-    return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
 
 
 def project(

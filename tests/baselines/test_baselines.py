@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_model
-from support.laws import close, numbers
+from support.laws import close, numbers, same_bits
 from support.tiny_baselines import HYPER, POINT_NERF, RASTERS
 from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
 from support.tiny_training import BATCH, L1_ONLY, create, step
 
-from experiments.baselines import npbg, point_nerf, points2nerf
+from experiments.baselines import npbg, point_nerf, points2nerf, ray_chunks
 from experiments.baselines.npbg import NPBG, GatedConv, NPBGConfig, half, raster, visible_points
 from experiments.baselines.point_nerf import PointNeRF, PointNeRFConfig
 from experiments.baselines.points2nerf import Hypernetwork, Points2NeRF
@@ -38,6 +38,14 @@ TRAININGS = {
     "point_nerf": trained(POINT_NERF, loss=MASKED, pixel_stride=3),
     "points2nerf": trained(HYPER, loss=points2nerf.SQUARES, optimizer=RADAM, pixel_stride=4),
 }
+
+
+def test_views_become_one_axis_of_rays_and_images_again():
+    views = camera()
+    rays, flat = cameras.camera_rays(views), cameras.view_rays(views)
+    images = ray_chunks.as_images(views, flat.directions, flat.origins[..., 0], flat.origins[..., 1])
+    same_bits(images.image, rays.directions)
+    same_bits((images.depth, images.acc), (rays.origins[..., 0], rays.origins[..., 1]))
 
 
 def count(tree):
@@ -270,7 +278,7 @@ def test_the_picture_is_that_of_the_plain_loops(variables, monkeypatch):
     monkeypatch.setattr(point_nerf, "BLOCK", 37)  # a chunk has 20 rays: neither divides what there is
     mask = np.random.default_rng(1).random((2, NUM_POINTS)) < 0.8
     some = dataclasses.replace(cloud(), mask=jnp.asarray(mask))
-    rendering = inference.jitted_render(variables, some, camera(), config=CONFIG)
+    rendering = tiny_model.render(variables, some, camera(), config=CONFIG)
     for i, j in ((0, 0), (1, 1)):
         one = jax.tree.map(lambda x, i=i: np.asarray(x[i]), some)
         expected = loop_render(variables["params"], one, jax.tree.map(lambda x, i=i, j=j: x[i, j], camera()))
@@ -304,7 +312,7 @@ def hyper_variables():
 
 
 def hyper_scenes():
-    return inference.jitted_encode(hyper_variables(), CLOUD, config=HYPER)
+    return tiny_model.encode(hyper_variables(), CLOUD, config=HYPER)
 
 
 def layer(params, x):

@@ -1,39 +1,17 @@
 """Empty space: open voxels, paths through them, and work that follows what exists."""
 
-import dataclasses
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import tiny_model
 from support.laws import close, same_bits
-from support.tiny_model import camera, cloud, wobbled
 
-from spnr_jax.config import RenderOptions
-from spnr_jax.kernels import cameras, voxels
-from spnr_jax.kernels.records import Rays, Scene
+from spnr_jax.kernels import voxels
+from spnr_jax.kernels.records import Rays
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.method import inference
 
-CONFIG = tiny_model.WITHOUT_UPSAMPLER
 RNG = np.random.default_rng(0)
 open_path, distance_at = jax.jit(voxels.open_path, static_argnames="num_cells"), jax.jit(voxels.distance_at)
-
-
-def near_points(config, reach):
-    return dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, reach=reach))
-
-
-@pytest.fixture(scope="module")
-def variables():
-    return wobbled(jax.jit(inference.network(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
-
-
-@pytest.fixture(scope="module")
-def scene(variables):
-    return inference.jitted_encode(variables, cloud(), config=CONFIG)
 
 
 class TestDilate:
@@ -119,57 +97,3 @@ class TestMapExisting:
             jax.block_until_ready(mapped(self.x, jnp.arange(23) >= 23 - existing))
             jax.effects_barrier()
             assert len(ran) == blocks
-
-
-class TestRendering:
-    def test_a_box_that_is_open_everywhere_is_rendered_as_without_skipping_and_so_is_its_gradient(
-        self, variables, scene
-    ):
-        def total(volume, config):
-            everywhere = Scene(volume=volume, occupied=jnp.ones_like(scene.occupied))
-            rendering = inference.render(variables, everywhere, camera(), config=config)
-            return jnp.sum(jnp.sin(rendering.image)) + jnp.sum(rendering.acc), rendering
-
-        both = jax.jit(jax.value_and_grad(total, has_aux=True), static_argnums=1)
-        ((_, expected), wanted), ((_, ours), gradient) = (
-            both(scene.volume, c) for c in (CONFIG, near_points(CONFIG, 1))
-        )
-        close(ours, expected, atol=2e-4)
-        assert (np.asarray(expected.depth) > 0).any()
-        assert np.linalg.norm(gradient - wanted) < 1e-3 * np.linalg.norm(wanted)
-
-    def test_rays_that_miss_the_points_are_white_and_transparent(self, variables, scene):
-        rendering = inference.jitted_render(variables, scene, camera(), config=near_points(CONFIG, 1))
-        rays = cameras.view_rays(cameras.resize(camera(), *rendering.acc.shape[-2:]))
-        near, far, _ = jax.jit(cameras.intersect_box)(rays.origins, rays.directions)
-        cells = 2 * CONFIG.encoder.volume_resolution
-        path = open_path(voxels.dilate(scene.occupied, 1), rays, near, far, num_cells=cells)
-        missed = np.asarray(path.travelled[..., -1] == 0).reshape(rendering.acc.shape)
-        assert missed.any()
-        assert not missed.all()
-        assert (np.asarray(rendering.image)[missed] == 1).all()
-        assert (np.asarray(rendering.acc)[missed] == 0).all()
-        close(np.asarray(rendering.depth)[missed], np.asarray(far).reshape(missed.shape)[missed])
-
-    def test_what_a_ray_draws_does_not_depend_on_the_rays_beside_it(self, variables, scene, monkeypatch):
-        """Devices of a mesh pack their own rays into blocks: a step must draw there what it draws on one device."""
-        config, generic = near_points(CONFIG, 1), camera(target=0.013)
-
-        @partial(jax.jit, static_argnames="block")
-        def jittered(key, block):
-            options = RenderOptions(block=block)
-            return inference.network(config).bind(variables).render(scene, generic, options, key)
-
-        few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
-        close(few, many, atol=1e-5)
-        still = inference.jitted_render(variables, scene, generic, config=config)
-        assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
-
-    def test_occupied_voxels_are_those_of_the_points(self, scene):
-        cell, _ = voxels.locate(cloud().positions, CONFIG.encoder.volume_resolution)
-        for i in range(2):
-            inside = np.asarray(cloud().mask[i]) & (np.abs(cloud().positions[i]) <= 1).all(-1)
-            x, y, z = np.asarray(cell[i])[inside].T
-            expected = np.zeros(scene.occupied.shape[1:], bool)
-            expected[z, y, x] = True
-            same_bits(scene.occupied[i], jnp.array(expected))

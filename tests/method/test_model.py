@@ -6,7 +6,7 @@ import inspect
 import jax
 import numpy as np
 import pytest
-from support import tiny_dataset, tiny_untrained
+from support import tiny_dataset, tiny_model, tiny_untrained
 from support.laws import close
 from support.surfel_clouds import cloud
 
@@ -15,7 +15,7 @@ from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import LARGEST_REACH, Camera, Volume
-from spnr_jax.method import inference, model, paper_method
+from spnr_jax.method import model, paper_method
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
 def test_the_handle_shows_what_the_evaluation_shows(handle):
     item = data_sets.read_object(tiny_dataset.dataset(), "ball_000004")
     expected = model.render_views(handle.variables, tiny_dataset.CONFIG.model, item.cloud, item.camera)
-    encoded = inference.jitted_encode(
+    encoded = tiny_model.encode(
         handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
     )
     volume = Volume(

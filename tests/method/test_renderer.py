@@ -1,6 +1,7 @@
 """The generator as a whole, shrunken: what must not change its pictures, and what must."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,25 +9,35 @@ import numpy as np
 import pytest
 from support import tiny_model
 from support.laws import close, same_bits
-from support.tiny_model import NUM_POINTS, camera, cloud, wobbled
+from support.tiny_model import NUM_POINTS, camera, cloud
 
-from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
-from spnr_jax.kernels import sampling
+from spnr_jax.config import RenderOptions
+from spnr_jax.kernels import cameras, sampling, voxels
 from spnr_jax.kernels.cameras import intersect_box
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Encoder
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
+open_path = jax.jit(voxels.open_path, static_argnames="num_cells")
 
 
 @pytest.fixture(scope="module")
 def variables():
-    return wobbled(jax.jit(inference.network(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
+    return tiny_model.variables()
 
 
 def encode(variables, cloud):
-    return inference.jitted_encode(variables, cloud, config=CONFIG)
+    return tiny_model.encode(variables, cloud, config=CONFIG)
+
+
+@pytest.fixture(scope="module")
+def encoded(variables):
+    return encode(variables, cloud())
+
+
+def near_points(config, reach):
+    return dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, reach=reach))
 
 
 def scene(volume):
@@ -34,7 +45,7 @@ def scene(volume):
 
 
 def render(variables, volume, camera, **options):
-    return inference.jitted_render(variables, volume, camera, config=CONFIG, **options)
+    return tiny_model.render(variables, volume, camera, config=CONFIG, **options)
 
 
 @jax.jit
@@ -93,7 +104,7 @@ class TestCloud:
             cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
         )
         inputs = module.apply({}, spoilt, method="point_inputs")
-        assert inputs.shape[-1] == 6 + sum(MATERIAL_CHANNELS[name] for name in materials)
+        assert inputs.shape[-1] == 6 + len(materials) + 2 * ("base_color" in materials)
         assert jnp.isfinite(inputs).all()
         names = iter(range(6, inputs.shape[-1]))
         for name in materials:
@@ -175,3 +186,57 @@ class TestJitter:
         twice = jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :1]], axis=1), camera())
         image = jittered(variables, cloud(), twice, jax.random.key(5))[0].image
         assert (jnp.abs(image[:, 0] - image[:, 1]) > 1e-6).any()
+
+
+class TestEmptySpace:
+    def test_a_box_that_is_open_everywhere_is_rendered_as_without_skipping_and_so_is_its_gradient(
+        self, variables, encoded
+    ):
+        def total(volume, config):
+            everywhere = Scene(volume=volume, occupied=jnp.ones_like(encoded.occupied))
+            rendering = inference.render(variables, everywhere, camera(), config=config)
+            return jnp.sum(jnp.sin(rendering.image)) + jnp.sum(rendering.acc), rendering
+
+        both = jax.jit(jax.value_and_grad(total, has_aux=True), static_argnums=1)
+        ((_, expected), wanted), ((_, ours), gradient) = (
+            both(encoded.volume, c) for c in (CONFIG, near_points(CONFIG, 1))
+        )
+        close(ours, expected, atol=2e-4)
+        assert (np.asarray(expected.depth) > 0).any()
+        assert np.linalg.norm(gradient - wanted) < 1e-3 * np.linalg.norm(wanted)
+
+    def test_rays_that_miss_the_points_are_white_and_transparent(self, variables, encoded):
+        rendering = tiny_model.render(variables, encoded, camera(), config=near_points(CONFIG, 1))
+        rays = cameras.view_rays(cameras.resize(camera(), *rendering.acc.shape[-2:]))
+        near, far, _ = jax.jit(cameras.intersect_box)(rays.origins, rays.directions)
+        cells = 2 * CONFIG.encoder.volume_resolution
+        path = open_path(voxels.dilate(encoded.occupied, 1), rays, near, far, num_cells=cells)
+        missed = np.asarray(path.travelled[..., -1] == 0).reshape(rendering.acc.shape)
+        assert missed.any()
+        assert not missed.all()
+        assert (np.asarray(rendering.image)[missed] == 1).all()
+        assert (np.asarray(rendering.acc)[missed] == 0).all()
+        close(np.asarray(rendering.depth)[missed], np.asarray(far).reshape(missed.shape)[missed])
+
+    def test_what_a_ray_draws_does_not_depend_on_the_rays_beside_it(self, variables, encoded):
+        """Devices of a mesh pack their own rays into blocks: a step must draw there what it draws on one device."""
+        config, generic = near_points(CONFIG, 1), camera(target=0.013)
+
+        @partial(jax.jit, static_argnames="block")
+        def jittered(key, block):
+            options = RenderOptions(block=block)
+            return inference.network(config).bind(variables).render(encoded, generic, options, key)
+
+        few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
+        close(few, many, atol=1e-5)
+        still = tiny_model.render(variables, encoded, generic, config=config)
+        assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
+
+    def test_occupied_voxels_are_those_of_the_points(self, encoded):
+        cell, _ = voxels.locate(cloud().positions, CONFIG.encoder.volume_resolution)
+        for i in range(2):
+            inside = np.asarray(cloud().mask[i]) & (np.abs(cloud().positions[i]) <= 1).all(-1)
+            x, y, z = np.asarray(cell[i])[inside].T
+            expected = np.zeros(encoded.occupied.shape[1:], bool)
+            expected[z, y, x] = True
+            same_bits(encoded.occupied[i], jnp.array(expected))

@@ -1,6 +1,7 @@
 """The shrunken network of the tests: weights, clouds and cameras of milliseconds."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from spnr_jax.config import EncoderConfig, PaperConfig, SamplingConfig
 from spnr_jax.kernels.cameras import look_at, pinhole
 from spnr_jax.kernels.records import PointCloud
+from spnr_jax.method import inference
 from support.laws import numbers
 
 SIZE = 24  # the smallest image that the discriminator can judge
@@ -51,6 +53,16 @@ def camera(size=8, target=0.0):
     eyes = jnp.asarray(np.float32([[[0, 1, 3], [3, 1, 0.5]], [[-2, 2, -2], [0.5, -1, 3]]]))
     pose = look_at(eyes, jnp.full(eyes.shape, target), jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), eyes.shape))
     return pinhole(pose, 0.9, size, size)
+
+
+encode = jax.jit(inference.encode, static_argnames="config")
+render = jax.jit(inference.render, static_argnames=("config", "options"))
+
+
+@functools.cache
+def variables():
+    """Weights of the network without its upsampler."""
+    return wobbled(jax.jit(inference.network(WITHOUT_UPSAMPLER).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 def wobbled(variables, seed):
