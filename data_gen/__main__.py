@@ -19,6 +19,9 @@ from spnr_jax.devices.arguments import parse as parse_options
 from spnr_jax.devices.arguments import split_debug, take_option
 from spnr_jax.errors import UserError, guard
 
+DESCRIPTION = """Data sets of rendered objects and their surface points.
+With --debug or SPNR_DEBUG=1 an error shows its call stack."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CheckConfig:
@@ -44,16 +47,8 @@ def parse(arguments: list[str]) -> Command:
     generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
     check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
     show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
-    description = (
-        "Data sets of rendered objects and their surface points. With --debug or SPNR_DEBUG=1 an error shows its"
-    )
-    return parse_options(
-        generate_options | check_options | show_options,
-        "spnr-data",
-        arguments,
-        f"{description} call stack.",
-        ("generate", "check", "show"),
-    )
+    commands = generate_options | check_options | show_options
+    return parse_options(commands, "spnr-data", arguments, DESCRIPTION, ("generate", "check", "show"))
 
 
 def preset_defaults(arguments: list[str]) -> GenerateConfig:

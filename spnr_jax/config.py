@@ -24,6 +24,7 @@ from spnr_jax.errors import UserError, require
 
 Quality = Literal["draft", "balanced", "best", "trained"]
 Material = Literal["base_color", "roughness", "metallic"]
+MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
 LARGEST = 2**63  # of any number in a config
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from data_gen.shapes import patterns
 from spnr_jax.formats.assets import Material
-from spnr_jax.formats.columns import srgb_to_linear
+from spnr_jax.kernels.imaging import srgb_to_linear
 
 METALS = {
     "steel": (0.56, 0.57, 0.58),

@@ -19,15 +19,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
+from spnr_jax.config import (
+    MATERIAL_CHANNELS,
+    LossConfig,
+    NetworkConfig,
+    OptimizerConfig,
+    RenderOptions,
+    TrainConfig,
+    check,
+)
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.imaging import resize_bilinear
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.nn.convolution import conv
-
-MATERIAL_CHANNELS = 5  # of a point: base colour, roughness, metallic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +57,7 @@ class NPBGConfig(NetworkConfig):
             f"encoder_widths must have one entry more than decoder_widths, got {self.encoder_widths} and "
             f"{self.decoder_widths}",
         )
-        inputs, widths = MATERIAL_CHANNELS + 1, self.encoder_widths
+        inputs, widths = sum(MATERIAL_CHANNELS.values()) + 1, self.encoder_widths
         require(min(widths[1:]) > inputs, f"encoder_widths must exceed the {inputs} channels of a raster, got {widths}")
         smallest = 2 ** len(self.encoder_widths)  # reflection needs two pixels at the coarsest scale
         require(

@@ -24,7 +24,15 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from experiments.baselines import ray_chunks
-from spnr_jax.config import LossConfig, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
+from spnr_jax.config import (
+    MATERIAL_CHANNELS,
+    LossConfig,
+    NetworkConfig,
+    OptimizerConfig,
+    RenderOptions,
+    TrainConfig,
+    check,
+)
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
@@ -34,7 +42,6 @@ from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.kernels.voxels import map_existing
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
-MATERIAL_CHANNELS = 5  # of a point: base colour, roughness, metallic
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it
 WIDENED = 0.001  # colours reach past [0, 1] by this, so that 0 and 1 are not at infinity
 
@@ -264,7 +271,7 @@ class PointNeRF(nn.Module):
 
     def setup(self) -> None:
         """The layers' weights; `shade` is a pure function of them."""
-        c, channels = self.config, MATERIAL_CHANNELS
+        c, channels = self.config, sum(MATERIAL_CHANNELS.values())
         inputs = channels * (1 + 2 * c.feature_frequencies) + 6 * 2 * c.offset_frequencies
         view = 3 * 2 * c.direction_frequencies
         sizes = {

@@ -35,9 +35,9 @@ from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
-from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels.cloud_arrays import make_cloud
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures

@@ -29,7 +29,8 @@ from PIL import Image, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import LONGEST_NAME, srgb_to_linear
+from spnr_jax.formats.columns import LONGEST_NAME
+from spnr_jax.kernels.imaging import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them

@@ -33,9 +33,14 @@ def read_cameras(
 
     `report` gets a line if lens distortion is left out.  ValueError, one line that names the file, if it has none.
     """
+    return cameras_of(read_document(path, report), rotation, origin)
+
+
+def read_document(path: str | Path, report: Callable[[str], None] = lambda line: None) -> Mapping[str, Any]:
+    """The content of a file of cameras, with `read_cameras`' report and errors: `cameras_of` takes it."""
     try:
         document = json.loads(Path(path).read_bytes())
-        cameras = cameras_of(document, rotation, origin)
+        cameras_of(document)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from None
     except UserError as error:
@@ -46,7 +51,7 @@ def read_cameras(
         raise UserError(f"{path}: no valid JSON, or something else where a number should be; {EXPECTED}") from None
     if any(frame.get(name) for frame in (document, *document["frames"]) for name in DISTORTION):
         report("lens distortion is left out: pinhole cameras are drawn")
-    return cameras
+    return document
 
 
 def cameras_of(

@@ -21,6 +21,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import stack_columns
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.gaussians import C0
 
 Columns = dict[str, np.ndarray]
@@ -295,11 +296,6 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     if not linear and len(values) >= LEAST and (share := np.mean(values.max(axis=-1) < DARK)) > MOSTLY:
         lines.append(f"{share:.0%} of {name} are nearly black: the picture will be black")
     return values if linear else srgb_to_linear(values), lines
-
-
-def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def full_scale(kind: np.dtype, highest: float, linear: bool = False) -> float:

@@ -6,31 +6,34 @@ gradients are finite at 0 and below.
 """
 
 import dataclasses
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.numerics import array_namespace
-from spnr_jax.kernels.records import AnyArray, Rendering
+from spnr_jax.kernels.records import Rendering
 
 WHITE = 1.0  # background of every picture
 
 # --- colours ----------------------------------------------------------------------------------------------------------
 
 
+Values = TypeVar("Values", jax.Array, np.ndarray)  # floats of any shape
 LINEAR_LIMIT, ENCODED_LIMIT = 0.0031308, 0.04045  # where line and power meet
 SLOPE, SCALE, OFFSET, EXPONENT = 12.92, 1.055, 0.055, 2.4
 
 
-def linear_to_srgb(linear: Float[AnyArray, "*batch"]) -> Float[AnyArray, "*batch"]:
+def linear_to_srgb(linear: Values) -> Values:
     """sRGB values of linear ones (IEC 61966-2-1): [0, 1] onto [0, 1]; nothing is clipped."""
     xp, power = array_namespace(linear), linear > LINEAR_LIMIT
     encoded = SCALE * xp.where(power, linear, 1) ** (1 / EXPONENT) - OFFSET
     return xp.where(power, encoded, SLOPE * linear)
 
 
-def srgb_to_linear(encoded: Float[AnyArray, "*batch"]) -> Float[AnyArray, "*batch"]:
+def srgb_to_linear(encoded: Values) -> Values:
     """Linear values of sRGB ones (IEC 61966-2-1): [0, 1] onto [0, 1]; nothing is clipped."""
     xp, power = array_namespace(encoded), encoded > ENCODED_LIMIT
     linear = ((xp.where(power, encoded, 1) + OFFSET) / SCALE) ** EXPONENT

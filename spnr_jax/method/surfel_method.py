@@ -115,6 +115,7 @@ def render(
 
 def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_scale: float) -> PlannedView:
     """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
+    surfel_renderer.check_camera(camera, "render")
     if render_scale != 1:
         camera = cameras.resize(
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))

@@ -84,11 +84,8 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     the cameras have none.  ValueError if a picture needs more entries than can be sorted.
     """
     _check_scene(scene, "plan")
-    batch, tails = np.shape(camera.cam_to_world)[:-2], [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
-    if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
-        raise UserError(f"plan: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
-    if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
-        raise UserError("plan: a focal length of camera.intrinsics is 0 or negative; expected pixels")
+    check_camera(camera, "plan")
+    batch = np.shape(camera.cam_to_world)[:-2]
     objects = np.shape(scene.spacing)
     if batch[: len(objects)] != objects:
         if batch:
@@ -102,6 +99,15 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
     needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
     return round_sizes(max_sizes(needed), doublings, side)
+
+
+def check_camera(camera: Camera, where: str) -> None:
+    """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
+    tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
+    if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
+        raise UserError(f"{where}: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
+    if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
+        raise UserError(f"{where}: a focal length of camera.intrinsics is 0 or negative; expected pixels")
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:

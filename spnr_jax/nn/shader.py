@@ -237,4 +237,4 @@ def compose_picture(
     specular = (1 + shine) * reflected + glow
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic
     linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
-    return smaller(jnp.asarray(linear_to_srgb(larger(linear, 0))), 1), alpha[..., 0]
+    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha[..., 0]

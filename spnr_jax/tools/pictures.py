@@ -28,7 +28,7 @@ from PIL import Image
 from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
-from spnr_jax.formats.camera_files import describe_cameras, read_cameras
+from spnr_jax.formats.camera_files import cameras_of, describe_cameras, read_document
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
@@ -74,7 +74,7 @@ def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Lig
 def _draw_background(light: Light, camera: Camera) -> Float[Array, "height width 3"]:
     """The environment map as seen by a camera, sRGB."""
     towards = list(jnp.moveaxis(camera_rays(camera).directions, -1, 0))
-    return jnp.asarray(linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1)))
+    return linear_to_srgb(jnp.minimum(jnp.stack(look_up_background(light, towards), axis=-1), 1))
 
 
 FIRST_AZIMUTH = 30.0  # degrees of the first still: a view that shows front and side
@@ -107,8 +107,7 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
     """
     model = load(options.run)
     check_takes_light(model, options.light_options_given, options.run)
-    if options.cameras:  # before the cloud is read, which takes time
-        read_cameras(options.cameras, report=lambda line: note(f"{options.cameras}: {line}"))
+    views = options.cameras and read_document(options.cameras, lambda line: note(f"{options.cameras}: {line}"))
     light = light_of_options(options.lighting) if options.light_options_given else None
     placed = clouds.place_cloud(
         options.cloud,
@@ -120,7 +119,7 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    cameras = read_cameras(options.cameras, rotation=placed.rotation, origin=placed.origin) if options.cameras else ()
+    cameras = cameras_of(views, placed.rotation, placed.origin) if views else ()
     volume = model.encode(placed.cloud, options.densify)
     return PreparedObject(placed=placed, model=model, volume=volume, light=light, cameras=cameras)
 

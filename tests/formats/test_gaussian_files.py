@@ -14,8 +14,8 @@ from support.point_clouds import BALL, GREEN, LINEAR, packed_splats, write
 from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.point_files import parse_ply
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.gaussians import C0, rotation_matrices
 
 NOTE = "ball.ply, drawn by spnr_jax (surfels), light: room"

@@ -14,10 +14,10 @@ from support.point_tables import WHOLE, as_scan
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.gltf import metallic_roughness, unpack
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import sample_surface
+from spnr_jax.kernels.imaging import srgb_to_linear
 
 LINEAR = srgb_to_linear(CHECKER / 255)
 TEXELS = np.random.default_rng(2).integers(0, 256, (2, 3, 4))

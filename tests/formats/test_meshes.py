@@ -11,9 +11,9 @@ from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent,
 
 from data_gen.plan.sources import find_meshes
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
+from spnr_jax.kernels.imaging import srgb_to_linear
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

@@ -11,7 +11,7 @@ from support import tiny_model
 from support.laws import close, same_bits
 from support.tiny_model import NUM_POINTS, camera, cloud
 
-from spnr_jax.config import RenderOptions
+from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
 from spnr_jax.kernels import cameras, sampling, voxels
 from spnr_jax.kernels.cameras import intersect_box
 from spnr_jax.kernels.records import Rays, Scene
@@ -104,7 +104,7 @@ class TestCloud:
             cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
         )
         inputs = module.apply({}, spoilt, method="point_inputs")
-        assert inputs.shape[-1] == 6 + len(materials) + 2 * ("base_color" in materials)
+        assert inputs.shape[-1] == 6 + sum(MATERIAL_CHANNELS[name] for name in materials)
         assert jnp.isfinite(inputs).all()
         names = iter(range(6, inputs.shape[-1]))
         for name in materials:

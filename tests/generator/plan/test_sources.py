@@ -11,8 +11,8 @@ from data_gen.plan import sources
 from data_gen.store import layout
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
-from spnr_jax.formats.columns import srgb_to_linear
 from spnr_jax.formats.meshes import load_mesh
+from spnr_jax.kernels.imaging import srgb_to_linear
 
 TINY = ["--resolution", 16, "--views", 2, "--points", 64, "--spp", 4, "--visibility-grid", 1]
 
