@@ -66,7 +66,7 @@ REFUSED = [  # command, what its line says
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
     ("render noise.npz --run RUN", "noise.npz"),
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
-    ("render point.xyz --run RUN", "holds 1 points in 1 place: no object can be drawn"),
+    ("render point.xyz --run RUN", "holds 1 point in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),
     ("render a.ply b.ply b/a.xyz", "two clouds have one name"),
     ("render . --run RUN", ".: a folder; expected a file of one of"),

@@ -13,6 +13,8 @@ from spnr_jax.errors import UserError
 
 # what tyro draws around an error, its marks of bold letters, and its name for the whole command
 BOX = r"[╭╮╰╯│─•]+|\[/?bold\]|__tyro-dummy-inner__\."
+UNION = r"no type matching (?:\{None\}\|)?(.+?) could be instantiated from \[(.+?)\]\..*?(?= Argument helptext)"
+HELP = r" Argument helptext:.*?(?= For full helptext)"
 
 
 def split_debug(arguments: list[str]) -> tuple[list[str], bool]:
@@ -44,6 +46,7 @@ def parse(
     except SystemExit as stop:
         if not stop.code:
             raise
-        said = re.sub(BOX, " ", stderr.getvalue().partition("\n")[2])  # without the title
+        said = " ".join(re.sub(BOX, " ", stderr.getvalue().partition("\n")[2]).split())  # without the title
+        said = re.sub(HELP, ".", re.sub(UNION, r"expected \1, got \2", said))
         command = next((f" {name}" for name in arguments[:1] if name in commands), "")
         raise UserError(said.replace(f"{prog} --help", f"{prog}{command} --help")) from None

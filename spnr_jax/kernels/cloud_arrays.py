@@ -50,6 +50,14 @@ def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None
         wanted = (*shape, 3) if name in VECTORS else shape
         if values is not None and np.shape(values) != wanted:
             raise UserError(f"{where}: cloud.{name} has the shape {np.shape(values)}, expected {wanted}")
+    if not shape[-1]:
+        raise UserError(f"{where}: the cloud has no points; give at least one")
+
+
+def refuse_tracers(arrays: Any, where: str) -> None:
+    """ValueError, which names the function, for arrays that JAX traces: what runs on the host needs their values."""
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arrays)):
+        raise UserError(f"{where}: runs on the host, so jax.jit, vmap and grad cannot trace it; call it before them")
 
 
 def strip(cloud: PointCloud) -> PointCloud:
@@ -206,7 +214,8 @@ def require_surface(positions: Float[np.ndarray, "points 3"], before: int) -> No
     steps = np.round((positions - positions.min(axis=0)) / max(PLACE * extent, np.finfo(np.float64).tiny))
     places = 1 if extent == 0 else len(np.unique(steps, axis=0)) if len(positions) < FEW**4 else FEW
     if places < 3:
-        raise UserError(f"holds {before} points in {places} place{'s' * (places > 1)}: no object can be drawn")
+        found = f"{before} point{'s' * (before > 1)} in {places} place{'s' * (places > 1)}"
+        raise UserError(f"holds {found}: no object can be drawn")
     centred = (positions - positions.mean(axis=0)) / extent
     variance = np.linalg.eigvalsh(centred.T @ centred)
     if variance[1] < LINE * variance[2]:

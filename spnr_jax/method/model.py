@@ -9,7 +9,7 @@ Clouds, cameras and depths are in the cloud's own units; the volume stores the t
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import get_args
 
@@ -32,6 +32,7 @@ from spnr_jax.kernels.records import (
 )
 from spnr_jax.methods import method_of
 
+COARSEST_STEP = 1e-3  # of float32 at a cloud's coordinates, relative to half its diagonal
 FIELD_OF_VIEW, DISTANCE = np.deg2rad(40.0), 3.0  # of the training cameras; the object fits into the unit sphere
 Angle = float | int | np.floating | jax.Array  # degrees
 
@@ -46,7 +47,7 @@ class Model:
     """
 
     config: NetworkConfig
-    variables: dict
+    variables: dict = field(repr=False)
 
     def encode(self, cloud: PointCloud, densify: bool = True) -> Volume:
         """Volume of a cloud (unbatched, any units, y up).  ValueError if it is empty or contains NaN or infinity.
@@ -54,10 +55,11 @@ class Model:
         Without `densify`, a sparse cloud gets no learned points: faster, but less sharp at rims and on curved parts.
         """
         cloud_arrays.check_cloud(cloud, "encode")
+        cloud_arrays.refuse_tracers(cloud, "Model.encode")
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
-            raise UserError("the cloud has no points; give at least one")
+            raise UserError("encode: the cloud has no points; give at least one")
         for name, values in vars(cloud).items():
             if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
                 raise UserError(f"the cloud has NaN or infinity in its {name}; remove those points")
@@ -66,6 +68,9 @@ class Model:
             if given.min() < 0 or given.max() > 1:
                 raise UserError(f"the cloud's {name} is {given.min():g} to {given.max():g}; expected 0 to 1, linear")
         centre, scale = cloud_arrays.normalization(positions[mask])
+        if scale * np.spacing(np.abs(positions[mask]).max()) > COARSEST_STEP:
+            step = f"the positions reach {np.abs(positions[mask]).max():g}, where float32 is too coarse for this cloud"
+            raise UserError(f"{step}: subtract its centre from positions and cameras first, in float64")
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)
@@ -122,8 +127,8 @@ class Model:
         Pure: angles and volume may be traced.
         """
         size = self.config.image_resolution if resolution is None else resolution
-        if not size >= 1:
-            raise UserError(f"resolution must be at least 1 pixel, got {size}")
+        if not isinstance(size, int | np.integer) or size < 1:
+            raise UserError(f"camera: resolution={size} is no number of pixels; `cameras.resize` makes other shapes")
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
 
     @property

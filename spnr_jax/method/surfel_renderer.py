@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError
-from spnr_jax.kernels import cameras
+from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
 from spnr_jax.kernels.numerics import larger
 from spnr_jax.kernels.records import (
@@ -47,6 +47,7 @@ SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture i
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
 GRID = 16  # a window's corner is a multiple: the network's pooling grid is the same from every camera
+ORTHONORMAL = 0.01  # largest error of the scalar products of a pose's axes
 LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 
 
@@ -84,6 +85,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     the cameras have none.  ValueError if a picture needs more entries than can be sorted.
     """
     _check_scene(scene, "plan")
+    cloud_arrays.refuse_tracers(scene, "plan")
     check_camera(camera, "plan")
     batch = np.shape(camera.cam_to_world)[:-2]
     objects = np.shape(scene.spacing)
@@ -103,11 +105,15 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
 
 def check_camera(camera: Camera, where: str) -> None:
     """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
+    cloud_arrays.refuse_tracers(camera, where)
     tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
     if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
         raise UserError(f"{where}: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
     if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
         raise UserError(f"{where}: a focal length of camera.intrinsics is 0 or negative; expected pixels")
+    rotation = np.asarray(camera.cam_to_world)[..., :3]
+    if not np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(initial=0) < ORTHONORMAL:
+        raise UserError(f"{where}: camera.cam_to_world is no rotation; was `up` along the view, or the pose scaled?")
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
@@ -206,13 +212,13 @@ def render(
     the cut after 24 entries.  Where one of these changes, where a normal turns away from the camera, and at the kinks
     of clipped values, the picture is only piecewise smooth.
     """
-    _check(scene, camera, light, plan)
+    _check(params, scene, camera, light, plan)
     light = lighting.room_light() if light is None else light
     window_buffer = rasterize_window(scene, camera, light, plan=plan)
     return shade_window(params, scene, camera, light, window_buffer, plan=plan)
 
 
-def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
+def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
     """ValueError in one line if there is not exactly one object, one view and one light."""
     check_light(light)
     _check_scene(scene, "render")
@@ -224,6 +230,8 @@ def _check(scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) 
     ):
         if np.shape(array) != wanted:
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
+    if params is not None and "params" not in params:
+        raise UserError(f"render: expected params=model.params, or None; got a dict of {', '.join(params)}")
     if not isinstance(plan, Plan):
         raise UserError(f"render: expected plan=spnr_jax.plan(scene, camera), got {type(plan).__name__}")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:

@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import triangles
-from spnr_jax.kernels.cloud_arrays import check_cloud
+from spnr_jax.kernels.cloud_arrays import check_cloud, refuse_tracers
 from spnr_jax.kernels.numerics import (
     array_namespace,
     clamp,
@@ -65,6 +65,7 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
     NumPy on the host: cannot be traced.  Clouds may have leading batch axes.
     """
     check_cloud(cloud, "neighbors", batched=True)
+    refuse_tracers(cloud, "neighbors")
     positions, mask = np.asarray(cloud.positions), np.asarray(cloud.mask)
     if not np.isfinite(positions[mask]).all():
         raise UserError("neighbors: cloud.positions has NaN or infinity; remove those points")
@@ -468,11 +469,17 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
 
 
 def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
-    """ValueError, which names the function and the argument, for shapes that do not fit each other."""
+    """ValueError, which names the function and the argument, for arrays that do not fit each other."""
     check_cloud(cloud, where)
     if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
         found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
         raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
+    if not isinstance(neighbors, jax.core.Tracer):
+        values = np.asarray(neighbors)
+        low, high = values.min(initial=-1), values.max(initial=-1)
+        if not np.issubdtype(values.dtype, np.integer) or low < -1 or high >= len(cloud.mask):
+            found = f"are {values.dtype} from {low} to {high}, expected indices of {len(cloud.mask)} points, or -1"
+            raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
 
 
 def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:

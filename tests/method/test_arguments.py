@@ -33,7 +33,22 @@ CALLS = {
     "model.encode(jax.tree.map(lambda x: x[None], cloud))": "encode: cloud.mask has the shape (1, 9)",
     "model.render(volume, camera, light='studio')": "light: expected a Light",
     "model.render(volume, camera, light=jax.tree.map(lambda x: x[:6], light))": "light.tables has the shape (6, 32",
-    "model.camera(scene, resolution=0)": "resolution must be at least 1 pixel, got 0",
+    "model.camera(scene, resolution=0)": "camera: resolution=0 is no number of pixels",
+    "model.camera(scene, resolution=(8, 8))": "camera: resolution=(8, 8) is no number of pixels",
+    "neighbors(jax.tree.map(lambda x: x[:0], cloud))": "neighbors: the cloud has no points",
+    "jax.jit(neighbors)(cloud)": "neighbors: runs on the host",
+    "jax.jit(lambda scene: plan(scene, camera))(scene)": "plan: runs on the host",
+    "jax.jit(lambda camera: plan(scene, camera))(camera)": "plan: runs on the host",
+    "jax.jit(lambda cloud: model.encode(cloud))(cloud)": "Model.encode: runs on the host",
+    "encode(None, cloud, near + 9)": "encode: neighbors are int32 from -1 to 17, expected indices of 9 points",
+    "densify({'densifier': {}}, cloud, near - 1)": "densify: neighbors are int32 from -2 to 7, expected indices",
+    "encode(None, cloud, near + 0.0)": "encode: neighbors are float64 from -1.0 to 8.0, expected indices",
+    "render(model.params['params'], scene, camera, plan=plan(scene, camera))": "render: expected params=model.params",
+    "plan(scene, camera.replace(cam_to_world=2 * camera.cam_to_world))": "plan: camera.cam_to_world is no rotation",
+    "plan(scene, camera.replace(cam_to_world=look_at(*np.eye(3)[[0, 1, 1]] * [[0], [9], [1]])))": "plan: camera.cam",
+    "model.encode(cloud.replace(positions=rows[0] + np.float32(1e7)))": "the positions reach 1e+07, where float32",
+    "spnr_jax.light_of(np.ones((32, 64, 3), np.uint8))": "light_of: expected finite linear radiance",
+    "spnr_jax.light_of(jax.numpy.full((32, 64, 3), -1.0))": "light_of: expected finite linear radiance",
     "light * light": "unsupported operand type",
     "spnr_jax.light_of(np.ones((64, 64, 3)))": "light_of: expected a map (height, 2 height, 3), got (64, 64, 3)",
     "spnr_jax.light_of(np.ones((32, 64)))": "light_of: expected a map (height, 2 height, 3), got (32, 64)",
@@ -49,6 +64,7 @@ import json, sys
 import jax, numpy as np
 import spnr_jax
 from spnr_jax import densify, encode, make_cloud, neighbors, plan, render
+from spnr_jax.kernels.cameras import look_at
 
 rows = np.random.default_rng(0).random((4, 9, 3)).astype(np.float32)
 cloud = make_cloud(*rows[:2], *rows[2:, :, 0])
