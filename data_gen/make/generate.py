@@ -22,7 +22,7 @@ from data_gen.make.objects import Workbench, make_and_write
 from data_gen.make.workers import run_tasks
 from data_gen.plan.tasks import PAPER_COUNTS, GenerateConfig, Plan, Task, check_options, plan_data_set, source_of
 from data_gen.render import light
-from data_gen.render.variant import choose_variant, mitsuba_module
+from data_gen.render.variant import choose_variant
 from data_gen.store import layout
 from data_gen.store.check import checksum_of
 from spnr_jax.errors import UserError
@@ -118,7 +118,7 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
     if not missing:
         return {}
     variant = settings["settings"]["variant"]
-    lights = make_lights(config, variant)
+    lights = make_lights(config)
     refuse_other_content(config.out, settings)  # another run may have begun there meanwhile
     write_whole(config.out / "dataset.json", layout.json_text(settings).encode())
     layout.remove_unfinished(config.out)
@@ -127,9 +127,8 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
     return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
 
 
-def make_lights(config: GenerateConfig, variant: str) -> light.Lights:
+def make_lights(config: GenerateConfig) -> light.Lights:
     """The light of the data set: one scaled map for all views, or kinds that each view draws from."""
-    mitsuba_module(variant)
     if config.lights:
         return light.Lights(kinds=light.read_kinds(config.lights))
     return light.Lights(light.scale_to_white(read_envmap(config.envmap) if config.envmap else indoor_envmap()))

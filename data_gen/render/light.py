@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.render.variant import mitsuba_module
-from data_gen.render.views import ViewConfig, make_sensor, spread_viewpoints
 from spnr_jax.errors import UserError
 from spnr_jax.formats.images import ENDINGS, read_envmap
 from spnr_jax.surfels import lighting, skies
@@ -42,7 +40,7 @@ class Lights:
             maps = self.kinds[generator.integers(len(self.kinds))]
             drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
             turned = np.roll(drawn, generator.integers(drawn.shape[1]), axis=1)
-            yield np.asarray(skies.normalise(turned, WHITE_SPHERE_RADIANCE))
+            yield scale_to_white(turned)
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -67,27 +65,6 @@ def map_files(folder: str) -> list[Path]:
     return files
 
 
-def scale_to_white(envmap: np.ndarray, target: float = WHITE_SPHERE_RADIANCE) -> np.ndarray:
-    """The map times the factor that makes a white diffuse sphere average `target`, measured by rendering it."""
-    return (envmap * (target / white_sphere_radiance(envmap))).astype(np.float32)
-
-
-def white_sphere_radiance(envmap: np.ndarray, num_views: int = 32, spp: int = 64, seed: int = 0) -> float:
-    """The mean linear radiance of a white diffuse sphere over views that surround it evenly."""
-    mi = mitsuba_module()
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 2, "hide_emitters": True},
-            "light": {"type": "envmap", "bitmap": mi.Bitmap(envmap)},
-            "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 1.0}},
-        }
-    )
-    config = ViewConfig(resolution=16, spp=spp)
-    radiance, coverage = 0.0, 0.0
-    for view, cam_to_world in enumerate(spread_viewpoints(num_views, config.distance)):
-        sensor = make_sensor(cam_to_world, config, config.resolution)
-        image = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed * num_views + view), dtype=np.float64)
-        radiance += image[..., :3].mean(-1).sum()
-        coverage += image[..., 3].sum()
-    return float(radiance / coverage)
+def scale_to_white(envmap: np.ndarray) -> np.ndarray:
+    """The map times the factor that makes a white diffuse sphere average WHITE_SPHERE_RADIANCE."""
+    return np.asarray(skies.normalise(envmap, WHITE_SPHERE_RADIANCE))
