@@ -57,7 +57,7 @@ class Conv(nn.Module):
     def __call__(self, x: Float[Array, "batch height width in"]) -> Float[Array, "batch height width features"]:
         """A picture of the same size."""
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
-        y = conv(x, jnp.asarray(kernel))
+        y = conv(x, jnp.asarray(kernel, x.dtype))
         return y + per_feature(self.param("bias", nn.initializers.zeros, (self.features,)), y)
 
 

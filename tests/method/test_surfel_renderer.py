@@ -51,6 +51,11 @@ def wobbled(fresh):
     return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
 
 
+def test_weights_in_bfloat16_draw_almost_the_same_picture(scene, wobbled):
+    half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), wobbled)
+    close(render(half, scene, camera(32)).image, render(wobbled, scene, camera(32)).image, atol=0.03)
+
+
 def test_more_padding_changes_no_surfel(scene):
     wider = encode_in_box(ball(), 1024)
     assert wider.surfels.mask.shape == (1024,)
