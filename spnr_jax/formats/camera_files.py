@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from spnr_jax.errors import UserError
+from spnr_jax.kernels.cameras import is_rotation
 from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
-WRONG = 1e-2  # largest difference of rotation @ rotation.T from the identity
 MOST_PIXELS = 2**14  # along a side
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
 
@@ -86,7 +86,7 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
     if not min(intrinsics[0, 0], intrinsics[1, 1]) > 0:
         raise UserError(f"focal lengths {across:g} and {down:g} in frame {number}, expected positive ones")
     turn = matrix[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > WRONG or np.linalg.det(turn) < 0:
+    if not is_rotation(turn):
         raise UserError(f"the rotation of frame {number} is not orthonormal")
     pose = np.concatenate([rotation @ turn, (rotation @ (matrix[:3, 3] - origin))[:, None]], axis=1)
     return Camera(cam_to_world=pose.astype(np.float32), intrinsics=intrinsics, height=height, width=width)

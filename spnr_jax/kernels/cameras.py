@@ -9,6 +9,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from spnr_jax.kernels.numerics import length, normalize, safe_divide
@@ -17,6 +18,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, Rays
 # A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
 # square of its inverse, which the gradient contains, stays far from overflow.
 PARALLEL = 1e-12
+ORTHONORMAL = 1e-2  # error of the scalar products of a rotation's columns, from which it is none
 
 
 def look_at(
@@ -104,6 +106,12 @@ def orbit(
     # from straight above or below, up in the picture is towards the back of the object
     up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
     return look_at(centre + distance * direction, centre, up)
+
+
+def is_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> bool:
+    """Whether all matrices are rotations, to a hundredth; on the host."""
+    wrong = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(initial=0)
+    return bool(wrong < ORTHONORMAL and np.linalg.det(matrices).min(initial=1) > 0)
 
 
 def move_into_box(camera: Camera, centre: Float[AnyArray, "3"], scale: Float[AnyArray, ""]) -> Camera:

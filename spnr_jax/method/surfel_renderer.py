@@ -47,7 +47,6 @@ SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture i
 MOST_DOUBLINGS = 4
 STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
 GRID = 16  # a window's corner is a multiple: the network's pooling grid is the same from every camera
-ORTHONORMAL = 0.01  # largest error of the scalar products of a pose's axes
 LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 
 
@@ -111,8 +110,7 @@ def check_camera(camera: Camera, where: str) -> None:
         raise UserError(f"{where}: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
     if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
         raise UserError(f"{where}: a focal length of camera.intrinsics is 0 or negative; expected pixels")
-    rotation = np.asarray(camera.cam_to_world)[..., :3]
-    if not np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(initial=0) < ORTHONORMAL:
+    if not cameras.is_rotation(np.asarray(camera.cam_to_world)[..., :3]):
         raise UserError(f"{where}: camera.cam_to_world is no rotation; was `up` along the view, or the pose scaled?")
 
 
