@@ -4,7 +4,7 @@
 """
 
 import warnings
-from importlib import import_module
+from importlib import import_module, metadata
 
 from jaxlib import version  # without JAX
 
@@ -46,6 +46,8 @@ def __getattr__(name: str):
     """Imports a public name or a kernel module at its first use, so that importing the package is fast."""
     if name in _KERNELS:
         return import_module(f"spnr_jax.kernels.{name}")
+    if name == "__version__":
+        return metadata.version("spnr-jax")
     if name not in _PUBLIC:
         raise AttributeError(f"module 'spnr_jax' has no attribute {name!r}")
     return getattr(import_module(f"spnr_jax.{_PUBLIC[name]}"), name)

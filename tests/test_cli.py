@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support import command_line, tiny_dataset, tiny_untrained
 
+import spnr_jax
 from spnr_jax import cli, presets
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
@@ -171,6 +172,13 @@ def test_the_preset_chooses_the_network_whose_options_there_are():
     command = cli.parse([*f"{TRAIN} {BASELINES} point_nerf_tiny".split(), "--radius", "0.2"])
     tiny = presets.PRESETS["point_nerf_tiny"]()
     assert command.config == dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, radius=0.2))
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert not stop.value.code
+    assert capsys.readouterr().out.startswith(f"spnr_jax {spnr_jax.__version__}, jax ")
 
 
 def test_help_explains_the_fields_of_a_config_and_loads_nothing_heavy():

@@ -5,6 +5,7 @@ import io
 import os
 import re
 from collections.abc import Collection
+from importlib import metadata
 from typing import Any
 
 import tyro
@@ -39,6 +40,9 @@ def parse(
     options: Any, prog: str, arguments: list[str], description: str | None = None, commands: Collection[str] = ()
 ) -> Any:
     """The options of a record, or of one of several commands of these names; UserError for what they do not allow."""
+    if arguments == ["--version"]:
+        print(f"spnr_jax {metadata.version('spnr-jax')}, jax {metadata.version('jax')}")
+        raise SystemExit(0)
     stderr = io.StringIO()
     try:
         with contextlib.redirect_stderr(stderr):

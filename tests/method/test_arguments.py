@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib import metadata
 
 import spnr_jax
 
@@ -93,3 +94,4 @@ def test_arguments_that_do_not_fit_are_named_in_one_line():
 def test_the_package_lists_its_public_names():
     assert {"load", "render", "PointCloud", "metrics"} <= set(dir(spnr_jax))
     assert all(hasattr(spnr_jax, name) for name in dir(spnr_jax))
+    assert spnr_jax.__version__ == metadata.version("spnr-jax")
