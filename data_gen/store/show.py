@@ -14,7 +14,7 @@ from data_gen.store import check, layout
 from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, on_white
-from spnr_jax.formats.images import png_url, template, write_whole
+from spnr_jax.formats.images import png_url, template, to_uint8, write_whole
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import PointCloud
 
@@ -59,8 +59,8 @@ def shown(dataset: Path, object_id: str) -> dict:
     details = check.read_details(dataset, object_id)
     ignored = "; ".join(details["ignored"])
     rows = {
-        "pictures": [white_bytes(image) for image in item.images],
-        "visible": [white_bytes(condition) for condition in item.conditions],
+        "pictures": [to_uint8(on_white(image)) for image in item.images],
+        "visible": [to_uint8(on_white(condition)) for condition in item.conditions],
         "points": [point_image(item.cloud, name) for name in CHANNELS],
     }
     return {
@@ -68,11 +68,6 @@ def shown(dataset: Path, object_id: str) -> dict:
         "note": f"{details['category']}{', ignored: ' + ignored if ignored else ''}",
         "rows": {label: [(max(96, x.shape[1]), png_url(x)) for x in pictures] for label, pictures in rows.items()},
     }
-
-
-def white_bytes(image: np.ndarray) -> np.ndarray:
-    """An RGBA picture on white as (height, width, 3) uint8."""
-    return np.round(255 * on_white(image)).astype(np.uint8)
 
 
 def point_image(cloud: PointCloud, channel: str) -> np.ndarray:

@@ -150,6 +150,8 @@ def view_config(settings: dict) -> views.ViewConfig:
 
 def unscaled_light(described: dict, envmap: Path | None) -> np.ndarray:
     """The environment map that a data set describes; ValueError if the file given is not it."""
+    if "kinds" in described:
+        raise UserError("each view of the data set has its own light, and Poisson surfaces are drawn in one for all")
     if described["sha256"] is None:
         if envmap:
             raise UserError(f"--envmap {envmap}: the {described['name']} lit the data set; leave the option out")

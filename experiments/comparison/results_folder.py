@@ -27,9 +27,11 @@ def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | 
     path = folder / "asked.json"
     if path.is_file():
         there = json.loads(path.read_text())
-        if different := [name for name in asked if there.get(name) != json.loads(json.dumps(asked[name]))]:
-            raise UserError(f"{folder} holds {what} with another {', '.join(different)}; choose another --out")
-    else:  # what is there stays as it is: studies may share a folder
+        different = [name for name in asked if there.get(name) != json.loads(json.dumps(asked[name]))]
+        if different:
+            found = f"{what} with another {', '.join(different)}" if "of" not in different else there.get("of")
+            raise UserError(f"{folder} holds {found}; choose another --out")
+    else:
         images.write_whole(path, as_json(asked))
 
 

@@ -22,7 +22,7 @@ from experiments import entry_point
 from experiments.comparison import figures, results_folder, scores
 from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
-from experiments.comparison.study_objects import cut
+from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
@@ -32,7 +32,7 @@ from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.scoring.evaluation import Pictures, check_light
 from spnr_jax.scoring.report import Table
 from spnr_jax.training.weights import load
 
@@ -77,7 +77,8 @@ def main(options: RelightingStudy) -> None:
     columns: dict[str, list[np.ndarray]] = {}
     for folder in options.data:
         dataset = data_sets.open_dataset(folder)
-        names, light = dataset.splits["test"][: options.objects], name_of(dataset)
+        check_light(model.config, dataset)
+        names, light = test_objects(dataset, options.objects), name_of(dataset)
         asked = {"run": options.run, "views": options.views, "objects": names, "resolution": options.resolution}
         results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)
         rows = {f"{light}/{count:,} points": partial(measure, options, model, count) for count in options.counts}

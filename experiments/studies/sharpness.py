@@ -29,7 +29,7 @@ from experiments.comparison import contenders, results_folder, scores
 from experiments.comparison.contenders import Method
 from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
-from experiments.comparison.study_objects import cut
+from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
 from spnr_jax import cli
 from spnr_jax.config import Quality
@@ -40,7 +40,7 @@ from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.evaluation import Pictures
+from spnr_jax.scoring.evaluation import Pictures, check_light
 from spnr_jax.scoring.report import Cell, Table, number
 
 COLUMNS = {
@@ -76,6 +76,8 @@ class SharpnessStudy:
     """Test objects (default: all)."""
     poisson: bool = False
     """Trimmed Poisson surfaces of the same points, path-traced by Mitsuba, too."""
+    envmap: Path | None = None
+    """Environment map that lit the data set, for the Poisson surfaces, where it is not the room."""
     normals: bool = False
     """Give the networks the normals of the data set, too; without them they are estimated."""
 
@@ -84,13 +86,15 @@ def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
     cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
-    names = dataset.splits["test"][: options.objects]
+    names = test_objects(dataset, options.objects)
     asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}
     results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
     models = contenders.of_runs(options.runs)
+    for model, _ in models.values():
+        check_light(model.config, dataset)
     compared = {label: contenders.of_model(*model) for label, model in models.items()}
     if options.poisson:
-        compared["Poisson, trimmed"] = Renderer(dataset.settings).method("poisson_trimmed")
+        compared["Poisson, trimmed"] = Renderer(dataset.settings, options.envmap).method("poisson_trimmed")
     rows, known = {}, {}
     for label, method in compared.items():
         for count in options.counts:

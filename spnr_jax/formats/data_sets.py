@@ -18,6 +18,7 @@ from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
+ROOM = "procedural room"  # the name of the package's room in a data set
 LONGEST_NAME = 200  # of an object, in bytes: file systems allow 255
 
 
@@ -55,6 +56,16 @@ class Dataset:
     def spread(self) -> Literal["random", "even"]:
         """How the objects' points lie; of even ones the first are evenly spread, too."""
         return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
+
+    def check_light(self) -> None:
+        """ValueError if one light lights all views, and it is not the room: the data set does not hold it."""
+        described = self.settings.get("environment_map")
+        name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
+        if name != ROOM:
+            raise UserError(
+                f"{self.folder}: lit by {name}, which it does not hold; generate it with --lights FOLDER, a light for "
+                "each view, or in Python give spnr_jax.training.trainer.train its light"
+            )
 
 
 def open_dataset(folder: Path | str) -> Dataset:

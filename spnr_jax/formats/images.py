@@ -49,17 +49,14 @@ def to_uint8(image: np.ndarray | Array) -> np.ndarray:
     return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
 
 
-def depth_image(
-    depth: np.ndarray | Array, acc: np.ndarray | Array, span: tuple[float, float] | None = None
-) -> np.ndarray:
+def depth_image(depth: np.ndarray | Array, acc: np.ndarray | Array) -> np.ndarray:
     """Colours (h, w, 3) uint8 of distances (h, w), near bright and far dark, fading to white with the opacity (h, w).
 
-    The colours (viridis, perceptually uniform) go from the nearest to the farthest distance of the span, or of the
-    opaque pixels of this one image.
+    The colours (viridis, perceptually uniform) go from the nearest to the farthest distance of the opaque pixels.
     """
     depth, acc = np.asarray(depth, np.float64), np.asarray(acc, np.float64)
     opaque = depth[acc > OPAQUE]
-    near, far = span or ((opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0))
+    near, far = (opaque.min(), opaque.max()) if opaque.size else (0.0, 1.0)
     nearness = np.clip((far - depth) / max(far - near, np.finfo(np.float32).tiny), 0, 1)
     opacity = np.clip(acc, 0, 1)[..., None]
     colors = np.frombuffer(bytes.fromhex(VIRIDIS), np.uint8).reshape(-1, 3) / 255

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from spnr_jax.config import TrainConfig
+from spnr_jax.config import NetworkConfig, TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -33,6 +33,7 @@ from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
+from spnr_jax.methods import method_of
 from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, metric_settings, summarise
 from spnr_jax.training.weights import Trained, read_trained
 
@@ -112,6 +113,12 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) 
         return float(np.mean(values))
 
     return max(RADIUS_FACTORS, key=mean_psnr)
+
+
+def check_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None:
+    """ValueError if the network is drawn in a light, and the data set's is not known."""
+    if method_of(config).takes_light:
+        dataset.check_light()
 
 
 def make_method(variables: dict, config: TrainConfig) -> Method:
@@ -238,6 +245,8 @@ def compare(
             f"{dataset.folder}: the {split} split is empty; score {others}, "
             "or generate the data set anew with --test-objects N"
         )
+    for one in trained.values():
+        check_light(one.config.model, dataset)
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
     methods |= {name: make_floor(name, factors.get(name, 1.0)) for name in FLOORS}

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cameras import camera_rays
@@ -78,6 +79,7 @@ GRAZING = 0.1  # cosine between ray and normal below which a pixel's depth is un
 FINEST = 1.25  # least side of a cube, in pixels of the pictures
 WIDTH, THICKNESS, OPACITY = 0.57, 0.03, 0.98  # of a splat: standard deviations in sides of a cube; opacity
 INSET = 0.5  # pixels that splats lie below the surface: at outlines, many are seen edge-on, and all extend outward
+FEWEST = 6  # splats: one for each axis and sign that a normal may be nearest to
 TRIES, ENOUGH = 6, 0.85  # cube sizes that are tried; share of the requested number that suffices
 
 
@@ -125,13 +127,16 @@ def collect_surface(views: Sequence[View], surfels: Surfels) -> SurfacePoints:
 
 def place_splats(surface: SurfacePoints, *, most: int, pixel: float) -> tuple[Gaussians, float]:
     """Grey splats, `most` or fewer, and the side of the cubes; `pixel` is the width of a pixel on the surface."""
+    if most < FEWEST:
+        raise UserError(f"splats: most={most}, expected {FEWEST} or more")
     side = max(FINEST * pixel, 1e-9)
     low = surface.position.min(axis=0)
+    number, group = _group_pixels(surface, low, side)
     for _ in range(TRIES):
-        number, group = _group_pixels(surface, low, side)
         if number <= most and (number >= ENOUGH * most or side <= FINEST * pixel):
             break
         side = max(side * np.sqrt(number / (0.5 * (1 + ENOUGH) * most)), FINEST * pixel)
+        number, group = _group_pixels(surface, low, side)
     while number > most:
         side *= 1.1
         number, group = _group_pixels(surface, low, side)
@@ -162,14 +167,8 @@ def _group_pixels(surface: SurfacePoints, low: np.ndarray, side: float) -> tuple
 
 
 def rotation_matrices(quaternion: Float[np.ndarray, "splats 4"]) -> Float[np.ndarray, "splats 3 3"]:
-    """Rotation matrices of unit quaternions w x y z."""
-    w, x, y, z = np.asarray(quaternion).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    """Rotation matrices of quaternions w x y z."""
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def rotate_to(normal: Float[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 4"]:

@@ -46,7 +46,7 @@ class Lighting:
         require_within(self, -MOST_STOPS, MOST_STOPS, "exposure")
 
 
-MOST_SPLATS = 300_000  # that a file or page is asked for: more than viewers on telephones draw
+FEWEST_SPLATS, MOST_SPLATS = 6, 300_000  # that are asked for: one for each side; more than viewers on telephones draw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class SplatOptions:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
-        require_within(self, 1, MOST_SPLATS, "most_splats")
+        require_within(self, FEWEST_SPLATS, MOST_SPLATS, "most_splats")
         require_at_least(self, 4, "fitting_views")
 
 

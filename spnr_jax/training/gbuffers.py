@@ -5,11 +5,14 @@
         seen0, seen1, ...      network input of each view, in the window around the object, float16
         maps, ambient, target  likewise: light maps in float16, the light's harmonics, the reference in 8 bits
 
-A file is a pure function of (seed, object, cloud) and is written atomically; an unreadable one is made again.  A batch
-is a pure function of (seed, step) and the list of files; its crops have equal doublings.
+A file is a pure function of object, cloud and what `digest` covers, which it holds as `source`; it is written
+atomically.  One that cannot be read, or was made of something else, is made again.  A batch is a pure function of
+(seed, step) and the list of files; its crops have equal doublings.
 """
 
 import dataclasses
+import hashlib
+import json
 import zlib
 from collections.abc import Callable, Generator
 from functools import partial
@@ -66,8 +69,6 @@ LARGEST_FLOAT16 = 6e4  # largest value in float16; brighter light does not make 
 LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it is 0
 CLOUD_STREAM, CROP_STREAM = 3, 4  # random streams under one seed, in addition to those of `batching`
 
-ROOM = "procedural room"  # its name in data sets
-
 Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
 
@@ -87,25 +88,15 @@ def prepare(
 
     ValueError if the light of the data set is not known.
     """
-    light = light or choose_light(dataset)
+    if light is None:
+        dataset.check_light()
+        light = lighting.room_light()
 
-    def batches_from(first_step: int) -> Generator[Crops, None, None]:
+    def batches_from(first_step: int) -> Generator[Crops, None, None]:  # no generator: a stop must reach `make_missing`
         variables = add_companions(config.model, {}, run)
         return batches(make_missing(dataset, light, config, run / "gbuffers", variables), config, first_step)
 
     return batches_from
-
-
-def choose_light(dataset: Dataset) -> Light:
-    """The light of a data set without a light per view; ValueError if it is not the room."""
-    described = dataset.settings.get("environment_map")
-    name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
-    if name != ROOM:
-        raise UserError(
-            f"{dataset.folder}: lit by {name}, and the command trains in the {ROOM} alone; give the light of that map "
-            "to spnr_jax.training.trainer.train"
-        )
-    return lighting.room_light()
 
 
 def loss(
@@ -136,16 +127,16 @@ def loss(
 
 
 def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
-    """The views of the data set; missing and broken files are made first; `variables` hold the densifier."""
-    views = []
+    """The views of the data set; missing, broken and other files are made first; `variables` hold the densifier."""
+    views, source = [], digest(dataset, light, config, variables)
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
         paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
-        found = [_doublings(path) for path in paths]
+        found = [_doublings(path, source) for path in paths]
         item = read_object(dataset, name) if None in found else None
         for number, path in enumerate(paths):
             if item is not None and found[number] is None:
                 programs.make_room()
-                arrays = make_views(item, number, light, config, variables)
+                arrays = make_views(item, number, light, config, variables) | {"source": source}
                 write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
         views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
@@ -154,12 +145,22 @@ def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Pa
     return views
 
 
-def _doublings(path: Path) -> list[int] | None:
-    """The doublings of each view in a file; None if the file is missing or unreadable."""
+def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict) -> UInt8[np.ndarray, "32"]:
+    """A checksum of everything but object and cloud that G-buffers are made of."""
+    names = "seed", "min_points", "max_points", "even_share", "views_per_object"
+    made_of = hashlib.sha256(json.dumps([[getattr(config, x) for x in names], dataset.settings]).encode())
+    for leaf in jax.tree.leaves((light, variables)):
+        made_of.update(np.asarray(leaf).tobytes())
+    return np.frombuffer(made_of.digest(), np.uint8)
+
+
+def _doublings(path: Path, source: UInt8[np.ndarray, "32"]) -> list[int] | None:
+    """The doublings of each view in a file; None if it is missing, unreadable or of another source."""
     try:
         with path.open("rb") as file:
-            return read_arrays(file, ("doublings",))["doublings"].tolist()
-    except (OSError, ValueError):
+            arrays = read_arrays(file, ("doublings", "source"))
+        return arrays["doublings"].tolist() if np.array_equal(arrays["source"], source) else None
+    except (OSError, ValueError, KeyError):
         return None
 
 

@@ -12,7 +12,8 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,15 +66,19 @@ def train(
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state
+        batches = stack.enter_context(closing(batches_from(first)))  # may take long: a stop ends it at once
         requests = stack.enter_context(stop_requests())
         log = stack.enter_context(closing(MetricsLog(run, first, config.num_steps)))
-        batches = stack.enter_context(closing(batches_from(first)))
         joins = optimisation.first_adversarial_step(config)
+        compiled: set[Any] = set()
         for done, batch in enumerate(batches, start=first + 1):
             if first < joins == done - 1:
                 tqdm.write(f"step {joins}: the discriminator joins; the training step is compiled anew")
-            state, metrics = take_step(state, batch, config, mesh, adversarial=done > joins)
-            log.step(done, metrics)
+            program = done > joins, jax.tree.structure(batch), tuple(np.shape(x) for x in jax.tree.leaves(batch))
+            with nullcontext() if program in compiled else log.untimed(state):
+                state, metrics = take_step(state, batch, config, mesh, adversarial=done > joins)
+                log.step(done, metrics)
+            compiled.add(program)
             last, stopping = done == config.num_steps, bool(requests)
             save = last or stopping or done % schedule.checkpoint_every == 0
             if save or done % schedule.log_every == 0:
@@ -180,7 +185,7 @@ def preview(
     columns, scores = [], []
     for name in names:
         item = data_sets.read_object(dataset, name)
-        cloud = data_sets.first_points(item, config.test_points)
+        cloud = replace(data_sets.first_points(item, config.test_points), normals=None)  # as `evaluate` does
         rendering = render_views(variables, config.model, cloud, item.camera, item.own_lights or light)
         image, reference = np.clip(np.asarray(rendering.image), 0, 1), data_sets.on_white(item.images)
         scores.append(np.asarray(psnr(jnp.asarray(image), jnp.asarray(reference))))
@@ -206,15 +211,23 @@ class MetricsLog:
         self._file = path.open("a")
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
         self._bar = tqdm(total=num_steps, initial=first_step, unit="step", mininterval=1)
-        self._compiled, self._since = first_step + 1, time.monotonic()
+        self._untimed, self._since = 0, time.monotonic()
         self._pending: list[tuple[int, dict]] = []
 
     def step(self, done: int, metrics: dict) -> None:
-        """Keeps a step's metrics for the next row; waits for the first step and does not time it: it compiles."""
+        """Keeps a step's metrics for the next row."""
         self._pending.append((done, metrics))
         self._bar.update()
-        if done == self._compiled:
-            jax.block_until_ready(metrics)
+
+    @contextmanager
+    def untimed(self, state: Any) -> Iterator[None]:
+        """A step that compiles, taken inside: it is waited for, and does not count as step time."""
+        jax.block_until_ready(state)
+        with self.paused():
+            yield
+            jax.block_until_ready(self._pending[-1])
+        self._untimed += 1
+        if self._untimed == len(self._pending):  # the wait for the first batch is no step, either
             self._since = time.monotonic()
 
     def mean(self) -> dict[str, int | float]:
@@ -225,10 +238,10 @@ class MetricsLog:
         rows, self._pending = check_finite(jax.device_get(self._pending)), []
         done, newest = rows[-1]
         row = {"step": done} | {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in newest}
-        now, timed = time.monotonic(), sum(at > self._compiled for at, _ in rows)
-        if timed:
+        now = time.monotonic()
+        if timed := len(rows) - self._untimed:
             row["ms_per_step"] = round(1000 * (now - self._since) / timed, 2)
-        self._since = now
+        self._untimed, self._since = 0, now
         self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         return row
 

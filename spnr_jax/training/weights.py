@@ -51,9 +51,14 @@ def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict
 
     The folder is the run's, or that of the weights file.
     """
-    own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
-    files = {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
-    return variables | {name: read_variables(path) for name, path in files.items()}
+    own, names = own_companions(config, folder), method_of(config).companions
+    return variables | {name: read_variables(own.get(name, packaged_file(name))) for name in names}
+
+
+def own_companions(config: NetworkConfig, folder: Path) -> dict[str, Path]:
+    """The files of companion networks that a folder holds, by name."""
+    files = {name: folder / f"{name}.npz" for name in method_of(config).companions}
+    return {name: path for name, path in files.items() if path.is_file()}
 
 
 def locate(source: Path | str | None) -> Path:

@@ -59,6 +59,8 @@ def test_the_light_has_to_be_that_of_the_data_set(tmp_path):
         poisson.unscaled_light(described, None)
     with pytest.raises(ValueError, match="leave the option out"):
         poisson.unscaled_light({"name": "procedural room", "sha256": None}, other)
+    with pytest.raises(ValueError, match="each view of the data set has its own light"):
+        poisson.unscaled_light({"kinds": [{"name": "random"}]}, None)
     views.mitsuba_module().Bitmap(np.ones((4, 8, 3), np.float32)).write(str(other))
     with pytest.raises(ValueError, match=r"not the studio.hdr"):
         poisson.unscaled_light(described, other)

@@ -34,7 +34,7 @@ def test_a_folder_is_one_requests_of_one_data_set(tmp_path):
         results_folder.claim(tmp_path, "scores", {"seed": 0, "objects": ("a", "b")}, dataset)
     with pytest.raises(ValueError, match="holds scores with another seed; choose another --out"):
         results_folder.claim(tmp_path, "scores", {"seed": 1, "objects": ["a", "b"]}, dataset)
-    with pytest.raises(ValueError, match="another of, data"):
+    with pytest.raises(ValueError, match="holds scores; choose another --out"):
         results_folder.claim(tmp_path, "pictures", {"seed": 0, "data": "another"})
 
 

@@ -70,6 +70,21 @@ def test_splats_lie_on_the_surface_and_along_it():
     assert side >= gaussians.FINEST * PIXEL
 
 
+@pytest.mark.parametrize("most", [6, 13, 29, 57, 120, 399])
+def test_splats_are_as_wide_as_the_cubes_that_they_stand_for(most):
+    surface = gaussians.collect_surface(views(), surfels())
+    splats, side = gaussians.place_splats(surface, most=most, pixel=PIXEL)
+    assert len(splats.position) <= most
+    assert gaussians._group_pixels(surface, surface.position.min(axis=0), side)[0] == len(splats.position)
+    shares = np.array([[gaussians.WIDTH, gaussians.WIDTH, gaussians.THICKNESS]])
+    np.testing.assert_allclose(splats.scale, np.repeat(side * shares, len(splats.scale), axis=0), rtol=1e-6)
+
+
+def test_fewer_splats_than_sides_are_refused():
+    with pytest.raises(ValueError, match="most=5, expected 6 or more"):
+        gaussians.place_splats(gaussians.collect_surface(views(), surfels()), most=5, pixel=PIXEL)
+
+
 def test_pixels_far_from_every_surfel_are_no_surface():
     outside = [seen._replace(depth=seen.depth - np.float32(0.5)) for seen in views()]
     with pytest.raises(ValueError, match="no surface"):

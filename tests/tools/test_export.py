@@ -1,6 +1,7 @@
 """The exported network draws the pictures of the pure functions where there is nothing but JAX."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -17,6 +18,7 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.skies import sun
 from spnr_jax.tools import export
+from spnr_jax.training import weights
 
 POINTS, SIZE = 128, 32
 # what a stranger does with the files: imports of ours and of Flax fail
@@ -65,13 +67,19 @@ def test_what_cannot_be_exported_or_loaded_is_refused_in_one_line(make, message)
 
 
 @pytest.mark.ci
-def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(tmp_path, monkeypatch, capsys):
+def test_a_process_that_knows_jax_alone_draws_the_pictures_of_the_pure_functions(
+    tmp_path, tmp_path_factory, monkeypatch, capsys
+):
+    run = shutil.copytree(tiny_surfels.untrained(), tmp_path_factory.mktemp("runs") / "run")
+    own = shutil.copy(weights.packaged_file("densifier"), run / "densifier.npz")
     monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     options = {"num_points": POINTS, "resolution": SIZE, "platforms": ("cpu", "cuda")}
-    cli.run(cli.Export(run=tiny_surfels.untrained(), out=tmp_path, **options))
+    cli.run(cli.Export(run=run, out=tmp_path, **options))
     capsys.readouterr()
     functions = {f"{name}.{kind}" for name in ("encode", "render") for kind in ("jax", "stablehlo")}
-    assert {path.name for path in tmp_path.iterdir()} == functions | {"weights.npz", "light.npz", "export.json"}
+    kept = {"weights.npz", "densifier.npz", "light.npz", "export.json"}
+    assert {path.name for path in tmp_path.iterdir()} == functions | kept
+    assert (tmp_path / "densifier.npz").read_bytes() == own.read_bytes(), "the run's own"
     assert (tmp_path / "encode.stablehlo").read_bytes().startswith(b"ML\xefR"), "MLIR's bytecode"
     said = json.loads((tmp_path / "export.json").read_text())
     assert said["render"]["platforms"] == ["cpu", "cuda"]

@@ -1,8 +1,11 @@
 """G-buffers on disk are a function of (seed, object, cloud), batches one of (seed, step); mirrored pairs stay pairs."""
 
 import dataclasses
+import os
 import shutil
+import signal
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +22,10 @@ from spnr_jax.kernels.records import Crops, PointCloud
 from spnr_jax.method import surfel_method
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
+from spnr_jax.scoring import evaluation
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.sides import DIRECTIONS, spiral, tangents
-from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, trainer
+from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, trainer, weights
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
 
@@ -45,8 +49,8 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
     one, two = sorted({view.path for view in tiny_surfels.views()})
     with np.load(one) as file, np.load(two) as other:
         again = made(CONFIG.seed, 0)
-        assert set(again) == set(file)
-        assert all(np.array_equal(again[name], file[name]) for name in file)
+        assert {*again, "source"} == set(file)
+        assert all(np.array_equal(again[name], file[name]) for name in again)
         for different in (other, made(CONFIG.seed + 1, 0)):
             assert not np.array_equal(different.get("seen0"), file["seen0"])
 
@@ -83,6 +87,38 @@ def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_b
     broken.write_bytes(whole[:-30])
     with pytest.raises(ValueError, match=r"npz: is a broken.*remove it"):
         gbuffers.read_view(gbuffers.View(broken, 0, 0))
+
+
+def test_files_made_of_something_else_are_made_again(monkeypatch, tmp_path):
+    dataset, made = tiny_surfels.dataset(), []
+    folder = shutil.copytree(tiny_surfels.views()[0].path.parent, tmp_path / "gbuffers")
+    monkeypatch.setattr(gbuffers, "make_views", lambda *_: made.append(1) or {"doublings": np.zeros(1, np.int64)})
+    changes = [
+        {"config": dataclasses.replace(CONFIG, **x)} for x in ({"seed": 1}, {"even_share": 0.1}, {"max_points": 39})
+    ]
+    changes += [{"light": 2 * LIGHT}, {"variables": {"densifier": np.ones(1, np.float32)}}]
+    changes += [{"dataset": dataclasses.replace(dataset, settings=dataset.settings | {"spp": 9})}]
+    for change in changes:
+        given = {"dataset": dataset, "light": LIGHT, "config": CONFIG, "folder": folder, "variables": {}} | change
+        before = len(made)
+        for _ in range(2):
+            gbuffers.make_missing(**given)
+        assert len(made) == before + gbuffers.CLOUDS, change
+
+
+def test_a_stop_while_g_buffers_are_made_ends_the_run_at_once(monkeypatch, tmp_path):
+    made = []
+
+    def make(*_):
+        made.append(1)
+        os.kill(os.getpid(), signal.SIGINT)
+        return {"doublings": np.zeros(1, np.int64)}
+
+    monkeypatch.setattr(gbuffers, "make_views", make)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(CONFIG, tiny_surfels.dataset(), tmp_path, SCHEDULE, light=LIGHT)
+    assert len(made) == 1
+    assert not (tmp_path / "metrics.jsonl").exists()
 
 
 def test_batches_are_a_function_of_seed_and_step():
@@ -260,10 +296,15 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(m
 
 def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
     dataset = tiny_surfels.dataset()
-    assert gbuffers.choose_light(dataset) is lighting.room_light()
+    dataset.check_light()
     other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
-    with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
-        gbuffers.choose_light(other)
+    for learn_or_score in (
+        lambda: gbuffers.prepare(CONFIG, other, Path("run"), light=None),
+        lambda: evaluation.compare({"surfels": weights.read_trained(tiny_surfels.untrained())}, other, "train"),
+    ):
+        with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
+            learn_or_score()
+    gbuffers.prepare(CONFIG, other, Path("run"), light=LIGHT)
 
 
 def test_ray_marching_networks_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):

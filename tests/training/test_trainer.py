@@ -1,5 +1,6 @@
 """The loop: stopped anywhere, it goes on to the same numbers; what breaks it is named and leaves a good state."""
 
+import contextlib
 import dataclasses
 import errno
 import os
@@ -129,6 +130,21 @@ def test_the_first_number_that_is_not_finite_is_named_and_means_are_of_the_steps
     log.close()
     assert row.pop("ms_per_step") > 0
     assert row == {"step": 2, "loss": 2.0, "discriminator": 5.0}
+
+
+def test_steps_that_compile_are_not_timed(monkeypatch, tmp_path):
+    clock = [0.0]
+    monkeypatch.setattr(trainer.time, "monotonic", lambda: clock[0])
+    log = trainer.MetricsLog(tmp_path, 0, 9)
+    found = []
+    for steps in (("compiled", 1, 1), (1, "compiled", 2, 3), ("compiled",), (4,)):
+        for seconds in steps:
+            with log.untimed(None) if seconds == "compiled" else contextlib.nullcontext():
+                clock[0] += 90 if seconds == "compiled" else seconds
+                log.step(1, {"loss": 1.0})
+        found.append(log.mean().get("ms_per_step"))
+    log.close()
+    assert found == [1000, 2000, None, 4000]
 
 
 def test_a_full_disk_is_one_line_and_exit_code_2(monkeypatch, tmp_path, capsys):
