@@ -105,13 +105,16 @@ def run_evaluate(command: Evaluate) -> None:
     """`spnr evaluate`."""
     check_installed("evaluate", "flip_evaluator", "train")
     from spnr_jax.formats import data_sets
+    from spnr_jax.formats.images import check_place
     from spnr_jax.scoring import evaluation
     from spnr_jax.scoring.report import describe_split, text_table, write_results
 
     start = time.monotonic()
     dataset = data_sets.open_dataset(command.data)
-    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
+    if out != command.run:
+        check_place(out / "metrics.json")
+    outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
     write_results(out, outcome, dataset.settings, seconds)
     print(f"{len(dataset.splits[command.split])} {describe_split(outcome.summary)}")

@@ -35,6 +35,7 @@ def check(config: Any, positive: Collection[str] = (), shares: Collection[str] =
     for name, kind in types_of(of).items():
         value = getattr(config, name)
         words = mismatch(value, kind)
+        words = words.replace("at least 0", "above 0") if name in positive else words
         if not words and name in positive:
             values = value if isinstance(value, tuple) else (value,)
             words = "" if all(x > 0 for x in values) else "positive"

@@ -91,6 +91,17 @@ REFUSED = [  # command, what its line says
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),
     ("export ball.xyz", "a file; expected a run folder, or of a cloud `spnr export ball.xyz --splats"),
     ("render ball.xyz --sun 40", "see spnr render --help"),
+    ("render ball.xyz --resolution 63.5", "--resolution: expected INT, got '63.5'."),
+    ("render ball.xyz --num-points 1.5", "--num-points: expected INT, got '1.5'."),
+    (
+        "evaluate UNTESTED ball.xyz",
+        "ball.xyz: a file; expected a run folder, a file of weights (.npz) or the name surfels",
+    ),
+    ("evaluate UNTESTED RUN --split train --out ball.xyz", "ball.xyz is a file, not a folder; choose another place"),
+    (
+        "evaluate UNTESTED RUN --split val",
+        "the val split is empty; score --split train, or generate the data set anew",
+    ),
     ("export RUN --light studio", "--light is for --splats"),
     ("export RUN --sun 40 30", "--sun is for --splats"),
     ("export RUN --fitting-views 8", "--fitting-views is for --splats"),

@@ -40,6 +40,7 @@ from spnr_jax.presets import PRESETS, tiny
         (OptimizerConfig, "ema_decay", 1.0, "below 1"),
         (OptimizerConfig, "warmup_steps", -1, "at least 0"),
         (TrainConfig, "num_steps", 0, "positive"),
+        (TrainConfig, "num_steps", -3, "a whole number, above 0"),
         (TrainConfig, "min_points", 5000, "max_points 4096"),
         (TrainConfig, "pixel_stride", 2, "neighbours"),
         (TrainConfig, "even_share", 1.1, "a share"),

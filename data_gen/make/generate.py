@@ -26,7 +26,7 @@ from data_gen.render.variant import choose_variant
 from data_gen.store import layout
 from data_gen.store.check import checksum_of
 from spnr_jax.errors import UserError
-from spnr_jax.formats.images import read_envmap, write_whole
+from spnr_jax.formats.images import check_place, read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap
 
 # options that say where or how fast, or whose content is described instead
@@ -135,7 +135,8 @@ def make_lights(config: GenerateConfig) -> light.Lights:
 
 
 def refuse_other_content(out: Path, settings: dict) -> None:
-    """ValueError if the place holds another data set, or anything else."""
+    """ValueError if the place holds another data set, or anything else, or can hold nothing."""
+    check_place(out / "dataset.json")
     if (out / "dataset.json").is_file():
         try:
             before = json.loads((out / "dataset.json").read_bytes())

@@ -34,7 +34,7 @@ def check(dataset: Path) -> bool:
             item = data_sets.read_object(data, object_id)
             found = object_faults(data, item, read_details(dataset, object_id))
         except (ValueError, OSError) as error:
-            faults.append(f"{object_id}: {type(error).__name__}: {error}")
+            faults.append(f"{object_id}: {error}")
             continue
         agreement = points_on_object(item)
         if agreement < LEAST_AGREEMENT:

@@ -13,8 +13,9 @@ import tyro
 from spnr_jax.errors import UserError
 
 # what tyro draws around an error, its marks of bold letters, and its name for the whole command
-BOX = r"[╭╮╰╯│─•]+|\[/?bold\]|__tyro-dummy-inner__\."
+BOX = r"[╭╮╰╯│─•]+|-{4,}|\[/?bold\]|__tyro-dummy-inner__\."
 UNION = r"no type matching (?:\{None\}\|)?(.+?) could be instantiated from \[(.+?)\]\..*?(?= Argument helptext)"
+NUMBER = r"(?:invalid literal for (int)\(\) with base 10|could not convert string to (float)): ('.*?')"
 HELP = r" Argument helptext:.*?(?= For full helptext)"
 
 
@@ -52,5 +53,6 @@ def parse(
             raise
         said = " ".join(re.sub(BOX, " ", stderr.getvalue().partition("\n")[2]).split())  # without the title
         said = re.sub(HELP, ".", re.sub(UNION, r"expected \1, got \2", said))
+        said = re.sub(NUMBER, lambda found: f"expected {(found[1] or found[2]).upper()}, got {found[3]}", said)
         command = next((f" {name}" for name in arguments[:1] if name in commands), "")
         raise UserError(said.replace(f"{prog} --help", f"{prog}{command} --help")) from None

@@ -119,7 +119,8 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
             raise
         path = folder / file
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error).replace(str(path), path.name)
-        raise UserError(f"{path}: cannot be read ({reason}); run `spnr-data check {dataset.folder}`") from None
+        advice = f"remove {folder} and run the same `spnr-data generate` again"
+        raise UserError(f"{path}: cannot be read ({reason}); {advice}") from None
     return ObjectData(name=name, cloud=cloud, camera=camera, images=images, conditions=conditions, lights=lights)
 
 

@@ -241,9 +241,9 @@ def compare(
     names = dataset.splits[split]
     if not names:
         others = " or ".join(f"--split {name}" for name, ids in dataset.splits.items() if ids) or "another split"
+        more = {"test": " with --test-objects N", "val": " with --val-fraction SHARE"}.get(split, "")
         raise UserError(
-            f"{dataset.folder}: the {split} split is empty; score {others}, "
-            "or generate the data set anew with --test-objects N"
+            f"{dataset.folder}: the {split} split is empty; score {others}, or generate the data set anew{more}"
         )
     for one in trained.values():
         check_light(one.config.model, dataset)

@@ -167,6 +167,9 @@ Arrays = dict[str, Any]
 
 def export_network(options: Export) -> str:
     """Writes the files of `spnr export RUN`; returns a line about them."""
+    if options.run.is_file() and options.run.suffix != ".npz":
+        cloud = f"of a cloud `spnr export {options.run} --splats OUT.ply`"
+        raise UserError(f"{options.run}: a file; expected a run folder, or {cloud}")
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
     model = Model(config=trained.config.model, variables=trained.variables)
     _check_exportable(model)

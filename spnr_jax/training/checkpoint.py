@@ -20,7 +20,7 @@ import jax
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, first_line
-from spnr_jax.formats.images import write_whole
+from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.methods import UnknownMethod, from_dict, to_dict
 from spnr_jax.training import optimisation
 
@@ -35,6 +35,7 @@ def lock_run(run: Path) -> Iterator[None]:
     """
     import fcntl  # Windows has none
 
+    check_place(run / "config.json")
     run.mkdir(parents=True, exist_ok=True)
     with (run / "training.lock").open("a") as file:
         try:
@@ -73,7 +74,7 @@ def read_config(run: Path | str) -> TrainConfig:
     """The config of a run folder; ValueError if there is none or it is not of this version."""
     path = Path(run) / "config.json"
     if Path(run).is_file():
-        raise UserError(f"{run}: a file; expected a run folder, or of a cloud `spnr export {run} --splats OUT.ply`")
+        raise UserError(f"{run}: a file; expected a run folder, a file of weights (.npz) or the name surfels")
     if not path.is_file():
         raise UserError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:

@@ -117,7 +117,8 @@ def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Tra
     if (step := int(state.step)) >= config.num_steps:
         tqdm.write(f"{run} is finished: {step} steps")
     elif step:
-        tqdm.write(f"resuming {run} at step {step} of {config.num_steps}")
+        unused = "" if init is None else "; the initial weights are for a new run, and not used"
+        tqdm.write(f"resuming {run} at step {step} of {config.num_steps}{unused}")
     return state
 
 
@@ -178,7 +179,10 @@ def preview(
     run: Path,
     light: Light | None = None,
 ) -> tuple[dict[str, float], np.ndarray]:
-    """Validation PSNR of the averaged network on a few objects, and the preview (references above renderings)."""
+    """PSNR of the averaged network on a few objects of validation, or else of training, and their preview.
+
+    The preview has references above renderings.
+    """
     names = (dataset.splits["val"] or dataset.splits["train"])[:PREVIEWED]
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
@@ -192,7 +196,8 @@ def preview(
         columns.append(np.concatenate([reference[0], image[0]]))
     picture = np.concatenate(columns, axis=1)
     write_whole(run / "previews" / f"{int(state.step):07d}.png", png(picture))
-    return {"val_psnr": float(np.mean(np.concatenate(scores)))}, picture
+    kind = "val" if dataset.splits["val"] else "train"
+    return {f"{kind}_psnr": float(np.mean(np.concatenate(scores)))}, picture
 
 
 # --- the record of a run ----------------------------------------------------------------------------------------------

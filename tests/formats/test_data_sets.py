@@ -32,7 +32,7 @@ def test_a_step_whose_object_is_broken_names_it_after_the_good_steps(copy):
     (copy / "objects" / broken / "images" / "001.png").unlink()
     line = batching.batches(data_sets.open_dataset(copy), config, 0)
     assert len(list(islice(line, 2))) == 2
-    with pytest.raises(ValueError, match=rf"{broken}.images.001\.png: cannot be read .*spnr-data check"):
+    with pytest.raises(ValueError, match=rf"{broken}.images.001\.png: cannot be read .*same `spnr-data generate`"):
         next(line)
 
 
@@ -43,8 +43,8 @@ def refused(copy, file):
         data_sets.read_object(data_sets.open_dataset(copy), NAMES[0])
     message = str(error.value)
     assert message.startswith(f"{path}: ")
-    assert message.count(str(path)) == 1
-    assert message.endswith(f"run `spnr-data check {copy}`")
+    assert message.count(str(path)) == 1, "not once more in the reason"
+    assert message.endswith(f"remove {copy / 'objects' / NAMES[0]} and run the same `spnr-data generate` again")
     assert "\n" not in message
     return message
 
