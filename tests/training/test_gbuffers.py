@@ -98,11 +98,12 @@ def test_files_made_of_something_else_are_made_again(monkeypatch, tmp_path):
     ]
     changes += [{"light": 2 * LIGHT}, {"variables": {"densifier": np.ones(1, np.float32)}}]
     changes += [{"dataset": dataclasses.replace(dataset, settings=dataset.settings | {"spp": 9})}]
+    given = {"dataset": dataset, "light": LIGHT, "config": CONFIG, "folder": folder, "variables": {}}
     for change in changes:
-        given = {"dataset": dataset, "light": LIGHT, "config": CONFIG, "folder": folder, "variables": {}} | change
+        gbuffers.make_missing(**given)
         before = len(made)
         for _ in range(2):
-            gbuffers.make_missing(**given)
+            gbuffers.make_missing(**given | change)
         assert len(made) == before + gbuffers.CLOUDS, change
 
 
