@@ -57,7 +57,7 @@ def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None
 def refuse_tracers(arrays: Any, where: str) -> None:
     """ValueError, which names the function, for arrays that JAX traces: what runs on the host needs their values."""
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arrays)):
-        raise UserError(f"{where}: runs on the host, so jax.jit, vmap and grad cannot trace it; call it before them")
+        raise UserError(f"{where}: runs on the host, so jit, vmap and grad cannot trace it; call it before them")
 
 
 def strip(cloud: PointCloud) -> PointCloud:

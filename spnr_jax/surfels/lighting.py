@@ -98,9 +98,9 @@ def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
         raise UserError(f"light_of: expected a map (height, 2 height, 3), got {shape}")
     if not isinstance(envmap, jax.core.Tracer):
         values = np.asarray(envmap)
-        if not (np.issubdtype(values.dtype, np.floating) and np.isfinite(values).all() and values.min() >= 0):
-            found = f"{values.dtype} from {values.min()}"
-            raise UserError(f"light_of: expected finite linear radiance from 0 on, got {found}")
+        if not (np.issubdtype(values.dtype, np.floating) and np.isfinite(values).all()):
+            found = f"{values.dtype} from {values.min()} to {values.max()}"
+            raise UserError(f"light_of: expected linear radiance in finite floats, got {found}")
     small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)
     tables = xp.matmul(_lobes(), small.reshape(-1, 3)).reshape(-1, HEIGHT, WIDTH, 3)
     return Light(tables=xp.concatenate([tables[:1], small[None], tables[1:]]))
