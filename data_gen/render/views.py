@@ -71,15 +71,6 @@ def random_viewpoints(num_views: int, distance: float, rng: np.random.Generator)
     return np.stack([look_at(distance * eye / np.linalg.norm(eye)) for eye in eyes])
 
 
-def spread_viewpoints(num_views: int, distance: float) -> np.ndarray:
-    """Cam_to_world (views, 4, 4) of cameras that surround the origin evenly (a Fibonacci spiral)."""
-    height = 1 - (2 * np.arange(num_views) + 1) / num_views
-    turn = np.arange(num_views) * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - height**2)
-    eyes = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], axis=1)
-    return np.stack([look_at(distance * eye) for eye in eyes])
-
-
 def project(cam_to_world: np.ndarray, positions: np.ndarray, config: ViewConfig) -> np.ndarray:
     """The image coordinates (points, 2) of positions (points, 3) before the camera: x right, y down, pixels."""
     local = (positions - cam_to_world[:3, 3]) @ cam_to_world[:3, :3]

@@ -7,6 +7,7 @@ from support.handmade import ball, plain
 from data_gen.render import light, variant, views
 from spnr_jax.formats.assets import Asset
 from spnr_jax.surfels.lighting import texel_directions
+from spnr_jax.surfels.sides import spiral
 from spnr_jax.surfels.skies import indoor_envmap
 
 
@@ -21,7 +22,7 @@ def test_a_white_diffuse_sphere_averages_0_6_under_the_scaled_map():
         }
     )
     config = views.ViewConfig(resolution=16, spp=64)
-    poses = views.spread_viewpoints(24, config.distance)
+    poses = [views.look_at(config.distance * eye) for eye in spiral(24)]
     sensors = [views.make_sensor(pose, config, config.resolution) for pose in poses]
     pictures = np.array([np.array(mi.render(scene, sensor=sensors[i], spp=64, seed=i)) for i in range(24)], np.float64)
     assert pictures[..., :3].mean(-1).sum() / pictures[..., 3].sum() == pytest.approx(0.6, rel=0.01)

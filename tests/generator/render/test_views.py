@@ -24,7 +24,7 @@ def strongest_channel(image, rows, columns):
 
 def test_cameras_are_orthonormal_right_handed_look_at_the_origin_and_stand_at_the_distance():
     poles = np.stack([views.look_at(3 * np.array([0.0, sign, 1e-9])) for sign in (-1, 1)])
-    for pose in [*poles, *views.random_viewpoints(50, 3.0, np.random.default_rng(0)), *views.spread_viewpoints(7, 3.0)]:
+    for pose in [*poles, *views.random_viewpoints(50, 3.0, np.random.default_rng(0))]:
         rotation, eye = pose[:3, :3], pose[:3, 3]
         np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
