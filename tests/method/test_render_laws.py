@@ -143,6 +143,7 @@ def test_order_and_padding_of_the_points_do_not_matter(params, scenes, views, li
     close(other, one, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.ci
 def test_remat_and_map_have_the_same_values_and_gradients(params, scenes, views, lights, value_and_gradient):
     scene, light = scenes[0], lights[0]
 
