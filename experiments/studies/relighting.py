@@ -32,7 +32,7 @@ from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.evaluation import Pictures, check_light
+from spnr_jax.scoring.evaluation import Pictures, check_known_light
 from spnr_jax.scoring.report import Table
 from spnr_jax.training.weights import load
 
@@ -77,7 +77,7 @@ def main(options: RelightingStudy) -> None:
     columns: dict[str, list[np.ndarray]] = {}
     for folder in options.data:
         dataset = data_sets.open_dataset(folder)
-        check_light(model.config, dataset)
+        check_known_light(model.config, dataset)
         names, light = test_objects(dataset, options.objects), name_of(dataset)
         asked = {"run": options.run, "views": options.views, "objects": names, "resolution": options.resolution}
         results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)

@@ -40,7 +40,7 @@ from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.model import Model
-from spnr_jax.scoring.evaluation import Pictures, check_light
+from spnr_jax.scoring.evaluation import Pictures, check_known_light
 from spnr_jax.scoring.report import Cell, Table, number
 
 COLUMNS = {
@@ -91,7 +91,7 @@ def main(options: SharpnessStudy) -> None:
     results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
     models = contenders.of_runs(options.runs)
     for model, _ in models.values():
-        check_light(model.config, dataset)
+        check_known_light(model.config, dataset)
     compared = {label: contenders.of_model(*model) for label, model in models.items()}
     if options.poisson:
         compared["Poisson, trimmed"] = Renderer(dataset.settings, options.envmap).method("poisson_trimmed")

@@ -57,7 +57,7 @@ class Dataset:
         """How the objects' points lie; of even ones the first are evenly spread, too."""
         return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
 
-    def check_light(self) -> None:
+    def check_lit_by_room(self) -> None:
         """ValueError if one light lights all views, and it is not the room: the data set does not hold it."""
         described = self.settings.get("environment_map")
         name = described.get("name", ROOM) if isinstance(described, dict) else ROOM

@@ -68,9 +68,10 @@ class Model:
             if given.min() < 0 or given.max() > 1:
                 raise UserError(f"the cloud's {name} is {given.min():g} to {given.max():g}; expected 0 to 1, linear")
         centre, scale = cloud_arrays.normalization(positions[mask])
-        if scale * np.spacing(np.abs(positions[mask]).max()) > COARSEST_STEP:
-            step = f"the positions reach {np.abs(positions[mask]).max():g}, where float32 is too coarse for this cloud"
-            raise UserError(f"{step}: subtract its centre from positions and cameras first, in float64")
+        farthest = np.abs(positions[mask]).max()
+        if scale * np.spacing(farthest) > COARSEST_STEP:
+            found = f"the positions reach {farthest:g}, where float32 is too coarse for this cloud"
+            raise UserError(f"{found}: subtract its centre from positions and cameras first, in float64")
         # the ends of a thin stick lie on the faces of the box: rounding must not push them out of it
         inside = np.clip((positions - centre) * scale, -1, 1).astype(np.float32)
         cloud = dataclasses.replace(cloud, positions=inside)

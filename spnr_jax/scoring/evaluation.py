@@ -115,10 +115,10 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) 
     return max(RADIUS_FACTORS, key=mean_psnr)
 
 
-def check_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None:
+def check_known_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None:
     """ValueError if the network is drawn in a light, and the data set's is not known."""
     if method_of(config).takes_light:
-        dataset.check_light()
+        dataset.check_lit_by_room()
 
 
 def make_method(variables: dict, config: TrainConfig) -> Method:
@@ -246,7 +246,7 @@ def compare(
             f"{dataset.folder}: the {split} split is empty; score {others}, or generate the data set anew{more}"
         )
     for one in trained.values():
-        check_light(one.config.model, dataset)
+        check_known_light(one.config.model, dataset)
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
     methods |= {name: make_floor(name, factors.get(name, 1.0)) for name in FLOORS}

@@ -180,8 +180,7 @@ def export_network(options: Export) -> str:
         "render": export_render(model, resolution=size, quality=options.quality, num_points=points, platforms=where),
     }
     weights.write_weights(out / "weights.npz", trained)
-    run = weights.locate(options.run)
-    for path in weights.own_companions(trained.config.model, run.parent if run.suffix == ".npz" else run).values():
+    for path in weights.own_companions(trained.config.model, weights.locate(options.run)).values():
         images.write_whole(out / path.name, path.read_bytes())
     room = {"tables": np.asarray(lighting.room_light().tables)}
     images.write_whole(out / "light.npz", pack_arrays(room, compressed=True))

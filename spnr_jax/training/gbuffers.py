@@ -89,7 +89,7 @@ def prepare(
     ValueError if the light of the data set is not known.
     """
     if light is None:
-        dataset.check_light()
+        dataset.check_lit_by_room()
         light = lighting.room_light()
 
     def batches_from(first_step: int) -> Generator[Crops, None, None]:  # no generator: a stop must reach `make_missing`

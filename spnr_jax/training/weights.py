@@ -46,17 +46,15 @@ def packaged_file(name: str = PACKAGED) -> Path:
     return Path(str(resources.files("spnr_jax") / "pretrained" / f"{name}.npz"))
 
 
-def add_companions(config: NetworkConfig, variables: dict, folder: Path) -> dict:
-    """The variables with those of companion networks (a densifier): from the folder, or else from the package.
-
-    The folder is the run's, or that of the weights file.
-    """
-    own, names = own_companions(config, folder), method_of(config).companions
+def add_companions(config: NetworkConfig, variables: dict, source: Path) -> dict:
+    """The variables with those of companion networks (a densifier): the source's own, or else the package's."""
+    own, names = own_companions(config, source), method_of(config).companions
     return variables | {name: read_variables(own.get(name, packaged_file(name))) for name in names}
 
 
-def own_companions(config: NetworkConfig, folder: Path) -> dict[str, Path]:
-    """The files of companion networks that a folder holds, by name."""
+def own_companions(config: NetworkConfig, source: Path) -> dict[str, Path]:
+    """The files of companion networks in a run folder, or beside a file of weights, by name."""
+    folder = source.parent if source.is_file() else source
     files = {name: folder / f"{name}.npz" for name in method_of(config).companions}
     return {name: path for name, path in files.items() if path.is_file()}
 
@@ -74,7 +72,7 @@ def read_trained(source: Path | str | None, say: Callable[[str], None] = print) 
     path = locate(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
-        return replace(trained, variables=add_companions(trained.config.model, trained.variables, path.parent))
+        return replace(trained, variables=add_companions(trained.config.model, trained.variables, path))
     from spnr_jax.training import checkpoint, optimisation  # here: a file of weights is read without optimisers
 
     config, state = checkpoint.load_run(path, say)

@@ -1,4 +1,4 @@
-"""G-buffers on disk are a function of (seed, object, cloud), batches one of (seed, step); mirrored pairs stay pairs."""
+"""G-buffers on disk follow from object, cloud and source, batches from (seed, step); mirrored pairs stay pairs."""
 
 import dataclasses
 import os
@@ -297,7 +297,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(m
 
 def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
     dataset = tiny_surfels.dataset()
-    dataset.check_light()
+    dataset.check_lit_by_room()
     other = dataclasses.replace(dataset, settings={"environment_map": {"name": "forest.hdr"}})
     for learn_or_score in (
         lambda: gbuffers.prepare(CONFIG, other, Path("run"), light=None),
