@@ -155,9 +155,17 @@ class Loading:
         return None
 
     def read_image(self, uri: str) -> np.ndarray | None:
-        """Texels (h, w, 4) of the image that `uri` names; None where it is missing."""
+        """Texels (h, w, 4) of the image that `uri` names; None where it is missing or cannot be read."""
         data = self.read(uri)
-        return None if data is None else read_image(data, uri[:80])
+        return None if data is None else self.decode_image(data, uri[:80])
+
+    def decode_image(self, data: bytes, name: str) -> np.ndarray | None:
+        """Texels (h, w, 4) of the bytes of an image; None where they cannot be read."""
+        try:
+            return read_image(data, name)
+        except UserError as error:
+            self.go_on_without(*str(error).split(": ", 1))
+        return None
 
     def say(self, *sentences: str, about: str = "") -> None:
         """Keeps sentences for the notes, or a name for one that begins so."""

@@ -35,20 +35,22 @@ SILENT = re.compile(r"^scalar_|[\s.:_-]+|(?<=colo)u(?=r)|^(vert(ex|ices)|points?
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
 PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
-PLANES, HEIGHTS = ("easting northing", "east north", "e n", "x y"), ("z", "height", "elevation", "altitude", "h")
+PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
+HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "el", "up", "höhe", "hoehe", "cota")
+COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
 ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
     + [names.split() for names in others.split("|") if names]
     for ours, stems, others in (
-        (POSITION, PLACES, "|".join(f"{plane} {height}" for plane in PLANES for height in HEIGHTS)),
-        (LINEAR, "basecolor albedo cd", ""),  # the last is Houdini's
-        (SRGB, "color colors rgb rgbs diffuse vertex", "r g b|rf gf bf|fr fg fb|r8 g8 b8"),
+        (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
+        (LINEAR, "basecolor albedo linear cd", ""),  # the last is Houdini's
+        (SRGB, "color colors rgb rgbs diffuse vertex col", "r g b|rf gf bf|fr fg fb|r8 g8 b8"),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
         (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
-        (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
+        (("alpha",), "", "a r g b|a red green blue|diffusealpha|colora|rgb3|color3|colors3"),
         (("opacity",), "", "opacities"),
         *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
@@ -117,6 +119,11 @@ def rename(columns: Columns) -> Columns:
     if "opacity" in found and columns.keys() & {SPLAT[0], "scale_0", "rot_0"}:
         found["splat_opacity"] = found.pop("opacity")
     return {name: x for name, x in found.items() if name not in ("rgb", "rgba") or x.dtype.itemsize >= 4}
+
+
+def name_places(names: list[str]) -> bool:
+    """Whether columns of these names hold positions, or one is x."""
+    return "x" in names or set(POSITION) <= rename(dict.fromkeys(names, np.zeros(1))).keys()
 
 
 def useful(columns: Columns) -> Columns:

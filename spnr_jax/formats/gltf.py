@@ -1,4 +1,4 @@
-"""glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node, in its rest pose.
+"""glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node or instance; skins in the pose of the nodes.
 
 Read here and not through trimesh, which leaves integers unscaled and drops fans (docs/lab/readers.md); tests compare
 the rest with it.  DracoPy (KHR_draco_mesh_compression) and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
@@ -27,7 +27,7 @@ from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.kernels.triangles import strip_faces
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 CHUNK_JSON = 0x4E4F534A  # of a .glb
 LOOSE = {"POINTS", "LINES", "LINE_LOOP", "LINE_STRIP"}
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
@@ -35,9 +35,14 @@ WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
 DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
 BASIS, WEBP, MOVED = "KHR_texture_basisu", "EXT_texture_webp", "KHR_texture_transform"
-READABLE = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, "KHR_mesh_quantization", "KHR_lights_punctual"}
-DROPPED = {"KHR_lights_punctual", "EXT_mesh_gpu_instancing"}  # of what a scene may use
-SPLATS = "KHR_gaussian_splatting"
+INSTANCES, VISIBILITY, SPLATS = "EXT_mesh_gpu_instancing", "KHR_node_visibility", "KHR_gaussian_splatting"
+READ = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCES, VISIBILITY, SPLATS, "KHR_mesh_quantization"}
+HARMLESS = {  # what a scene looks like without them
+    *("KHR_lights_punctual", "KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata"),
+    *("EXT_mesh_features", "KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
+}
+MATERIALS = "KHR_materials_"  # of which those that are not modelled are named one by one
+MOTION, SKIN = ("TRANSLATION", "ROTATION", "SCALE"), ("JOINTS_0", "WEIGHTS_0")
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
 FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
@@ -58,19 +63,20 @@ MOST_REPEATED, PLACING = 2**23, 64
 def load_gltf(path: Path, loading: Loading) -> list[Part]:
     """The scene's triangles with their materials, as they lie in the file."""
     file, ignored = GltfFile(path, loading), loading.ignored
-    document, drawn = file.document, list(list_primitives(file.document))
+    document = file.document
     for extension in document.get("extensionsRequired", []):
-        if extension not in (*READABLE, SPLATS) and not extension.startswith("KHR_materials_"):
+        if extension not in READ | HARMLESS and not extension.startswith(MATERIALS):
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
-    modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, _ in drawn}
+    drawn = list(list_primitives(file))
+    modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, *_ in drawn}
     # points are read where there is nothing else
     wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
-    ignored |= {key for key in ("animations", "skins") if document.get(key)}
-    ignored |= DROPPED.intersection(document.get("extensionsUsed", []))
+    ignored |= {"animations"} & document.keys()
+    ignored |= {name for name in {*document.get("extensionsUsed", [])} - READ if not name.startswith(MATERIALS)}
     read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
-    for primitive, matrix in drawn:
+    for primitive, matrix, joints in drawn:
         if not (mode := modes[id(primitive)]).startswith(wanted):
             ignored.add(f"{mode} primitives")
             continue
@@ -92,6 +98,7 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
+        matrix = matrix if joints is None else _bend(columns, joints)
         part = _place(columns, faces, material, placement, matrix)
         if (asks_alpha or mode == "POINTS") and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
             ignored |= {"alpha of vertex colours"} if asks_alpha else set()
@@ -100,30 +107,70 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     return parts
 
 
-def list_primitives(document: dict) -> Iterator[tuple[dict, np.ndarray]]:
-    """(primitive, matrix to world (4, 4)) of every node of the default scene that draws a mesh, depth first."""
-    nodes, seen = document.get("nodes", []), set()
+def list_primitives(file: "GltfFile") -> Iterator[tuple[dict, np.ndarray, np.ndarray | None]]:
+    """(primitive, matrix to world (4, 4), those of its skin's joints (j, 4, 4)) of all that is drawn, depth first.
+
+    Of the default scene: every primitive of each node's mesh, or of each of its instances.
+    """
+    document = file.document
+    nodes, world = document.get("nodes", []), dict[int, np.ndarray]()
     if scenes := document.get("scenes"):
         roots = scenes[document.get("scene", 0)].get("nodes", [])
     else:
         roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-    stack = [(root, np.eye(4)) for root in reversed(roots)]
+    stack = [(root, np.eye(4), True) for root in reversed(roots)]
+    shown: list[int] = []
     while stack:
-        index, parent = stack.pop()
-        if index in seen:
+        index, parent, visible = stack.pop()
+        if index in world:
             raise UserError(f"its node {index} is reached twice: the scene is not a tree")
-        seen.add(index)
         node = nodes[index]
-        if "matrix" in node:
-            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
-        else:
-            x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-            own = quaternion_matrix([w, x, y, z])
-            own[:3, :3] *= node.get("scale", (1, 1, 1))
-            own[:3, 3] = node.get("translation", (0, 0, 0))
-        if "mesh" in node:
-            yield from ((primitive, parent @ own) for primitive in document["meshes"][node["mesh"]]["primitives"])
-        stack += [(child, parent @ own) for child in reversed(node.get("children", []))]
+        own = np.array(node["matrix"], np.float64).reshape(4, 4).T if "matrix" in node else _matrix(**_motion(node))
+        world[index] = parent @ own
+        visible &= node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+        shown += [index] if visible and "mesh" in node else []
+        stack += [(child, world[index], visible) for child in reversed(node.get("children", []))]
+    for index in shown:
+        node, joints, instances = nodes[index], None, [np.eye(4)]
+        if "skin" in node:  # then the place of the node itself does not count
+            skin = document["skins"][node["skin"]]
+            joints = np.stack([world.get(joint, np.eye(4)) for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                inverse = file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
+                joints = joints @ np.swapaxes(inverse.reshape(-1, 4, 4), 1, 2)
+        elif INSTANCES in node.get("extensions", {}):
+            moves = file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION)
+            if max(map(len, moves.values())) > MOST_REPEATED / PLACING:
+                raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+            instances = [_matrix(**dict(zip(moves, row, strict=True))) for row in zip(*moves.values(), strict=True)]
+        for instance in instances:
+            for primitive in document["meshes"][node["mesh"]]["primitives"]:
+                yield primitive, world[index] @ instance, joints
+
+
+def _motion(node: dict) -> dict[str, Any]:
+    return {name: node[name.lower()] for name in MOTION if name.lower() in node}
+
+
+def _matrix(TRANSLATION: Any = (0, 0, 0), ROTATION: Any = (0, 0, 0, 1), SCALE: Any = (1, 1, 1)) -> np.ndarray:
+    """The matrix (4, 4) of a scale, then a rotation (x, y, z, w), then a translation."""
+    x, y, z, w = ROTATION
+    matrix = quaternion_matrix([w, x, y, z])
+    matrix[:3, :3] *= np.asarray(SCALE, np.float64)
+    matrix[:3, 3] = TRANSLATION
+    return matrix
+
+
+def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray:
+    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four each."""
+    if not {"JOINTS_0", "WEIGHTS_0"} <= columns.keys():
+        raise UserError("has a skin whose vertices name no joints: broken file")
+    numbers, weights = columns["JOINTS_0"], columns["WEIGHTS_0"].astype(np.float64)
+    if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= len(joints):
+        raise UserError(f"has vertices on joint {numbers.max()} of {len(joints)}: broken file")
+    weights[weights.sum(axis=1) <= 0, 0] = 1
+    weights /= weights.sum(axis=1, keepdims=True)
+    return sum(weights[:, i, None, None] * joints[numbers[:, i]] for i in range(numbers.shape[1]))
 
 
 def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
@@ -131,7 +178,7 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     if DRACO in primitive.get("extensions", {}):
         file.unpack_mesh(primitive)
         mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
-    columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0", texcoords)
+    columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0", *SKIN, texcoords)
     order = np.arange(len(columns["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
@@ -145,20 +192,24 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
 
 
 def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Placement", matrix: np.ndarray) -> Part:
-    """One primitive in world space."""
-    linear = matrix[:3, :3]
-    side = -1 if np.linalg.det(linear) < 0 else 1
+    """One primitive in world space, by one matrix (4, 4) or one for each vertex (v, 4, 4)."""
+    linear = matrix[..., :3, :3]
+    side = -1 if np.median(np.linalg.det(linear)) < 0 else 1
     # of the matrix, a multiple of the inverse transpose that is defined where it is singular too
-    cofactors = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
+    cofactors = np.cross(np.roll(linear, -1, axis=-2), np.roll(linear, -2, axis=-2))
     normals, colors, texcoords = (columns.get(name) for name in ("NORMAL", "COLOR_0", f"TEXCOORD_{place.texcoord_set}"))
     return Part(
-        positions=columns["POSITION"] @ linear.T + matrix[:3, 3],
+        positions=_turned(columns["POSITION"], linear) + matrix[..., :3, 3],
         faces=faces[:, ::side],
         material=material,
-        normals=None if normals is None else normals @ cofactors.T * side,
+        normals=None if normals is None else _turned(normals, cofactors) * side,
         texcoords=None if texcoords is None else texcoords @ np.array(place.turn).T + np.array(place.offset),
         colors=None if colors is None else colors[:, :3],
     )
+
+
+def _turned(vectors: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    return (linear @ vectors[..., None])[..., 0]
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -319,11 +370,12 @@ def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
     webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
     source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
     if source is None:
-        raise UserError(f"has a texture that cannot be read: {', '.join(extensions) or 'no image'}")
+        file.loading.go_on_without("has a texture that cannot be read", ", ".join(extensions) or "no image")
+        return None
     image = file.document["images"][source]
     if "uri" in image:
         return file.loading.read_image(image["uri"])
-    return assets.read_image(bytes(file.view(image["bufferView"])), f"image {source}")
+    return file.loading.decode_image(bytes(file.view(image["bufferView"])), f"image {source}")
 
 
 def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:

@@ -1,9 +1,10 @@
 """Wavefront OBJ + MTL as parts; vertex colours are read as those of points are (columns.py).
 
 Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
-a map; roughness is Pr, else sqrt(2 / (Ns + 2)), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (a
-cut-out at a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with
-the same three corners, as ShapeNet has for the two sides, one is kept, that of the material used first.
+a map; roughness is Pr, else 1 - sqrt(Ns / 1000) by Blender's exporter and sqrt(2 / (Ns + 2)) by others, at least 0.5
+without a highlight (Ks 0, illum 0 or 1), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (a cut-out at
+a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with the same
+three corners, as ShapeNet has for the two sides, one is kept, that of the material used first.
 """
 
 import re
@@ -16,14 +17,16 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
 from spnr_jax.formats.columns import SRGB, Columns, colors_of, full_scale
-from spnr_jax.formats.point_tables import open_text
+from spnr_jax.formats.point_tables import UNDEFINED, open_text
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
 
 Rests = dict[str, list]
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
+NEARLY_GREY = 16  # of 255: between the channels of a grey JPEG
 READ = {"kd", "pr", "pm", "ns", "d", "tr", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
+SHININESS = re.compile(r"\s*# Blender( MTL)?")  # of an MTL by Blender: Ns is 1000 (1 - roughness)^2, once 900
 OPTION = re.compile(
     r"-(\w+)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+"
 )
@@ -37,7 +40,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         raise UserError("has no faces, and no vertices")
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
-    columns = _columns(text)
+    columns = _columns(text, loading)
     colors, notes = colors_of(columns) or (None, [])
     loading.say(*notes)
     if not text["f sizes"]:
@@ -46,8 +49,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         none = np.zeros((0, 3), np.int64)
         return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
-    for name in text["mtllib"]:
-        library |= parse_mtl(loading.read(name.strip()) or b"")
+    for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+", names.strip())):
+        library |= parse_mtl(loading.read(name) or b"")
     looks: dict[str, Material | None] = {}
     for name in dict.fromkeys(text["usemtl"]):
         looks[name] = make_material() if not name else _look(name, library.get(name), loading)
@@ -55,6 +58,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
             looks[name] = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
+        elif colors is not None and look is not None:
+            loading.say("colours of the vertices multiply those of the material", about=repr(name))
     parts = _parts(text, stack_columns(columns), colors, looks, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
@@ -87,13 +92,18 @@ def _parse(content: str) -> Rests:
 def _table(rows: list[str], width: int | None) -> np.ndarray:
     """The first numbers (rows, width) of each row, all if there is no width."""
     columns = None if width is None else range(width)
-    return np.loadtxt(rows, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
+    plain = [UNDEFINED.sub("nan", row) if "n" in row or "#" in row else row for row in rows]
+    return np.loadtxt(plain, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
 
 
-def _columns(text: Rests) -> Columns:
-    """The columns of the vertices: positions, and perhaps colours."""
+def _columns(text: Rests, loading: Loading) -> Columns:
+    """The columns of the vertices: positions, and perhaps colours, white where only some have one (as of Blender)."""
+    rows, lengths = text["v"], [len(row.partition("#")[0].split()) for row in text["v"]]
+    if {*lengths} == {3, 6}:
+        loading.say(f"{lengths.count(3):,} of {len(rows):,} vertices have no colour: white taken")
+        rows = [row.partition("#")[0] + " 1 1 1" * (length == 3) for row, length in zip(rows, lengths, strict=True)]
     try:
-        table = _table(text["v"], None)
+        table = _table(rows, None)
     except ValueError as error:
         if "number of columns" not in str(error):
             raise
@@ -150,15 +160,24 @@ def _first_of_doubles(corners: np.ndarray) -> np.ndarray:
 
 
 def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
-    """Statements of an MTL file: material name -> keyword in lower case -> rest of the line."""
+    """Statements of an MTL file: material name -> keyword in lower case -> rest of the line.
+
+    Of Blender's also `pr`, the roughness that Ns stands for there.
+    """
     library: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
-    for line in data.decode("utf-8-sig", "replace").splitlines():
+    text = data.decode("utf-8-sig", "replace")
+    blender = SHININESS.match(text)
+    for line in text.splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword.lower() == "newmtl":
             current = library.setdefault(rest.strip(), {})
         elif keyword and not keyword.startswith("#"):
             current[keyword.lower()] = re.sub(r"\s#.*", "", rest).strip()
+    for entry in library.values() if blender else ():
+        if "ns" in entry:
+            full = 900 if blender[1] else 1000
+            entry.setdefault("pr", str(1 - min(max(float(entry["ns"]) / full, 0), 1) ** 0.5))
     return library
 
 
@@ -193,6 +212,8 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Material
             ignored.add("MTL Kd beside map_Kd")
         color = decode_texels(maps["map_kd"][..., :3], assets.SRGB_TABLE)
     shiny = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
+    if entry.get("illum") in ("0", "1") or not entry.get("ks", "1").strip("0. "):
+        shiny = max(shiny, 0.5)
     roughness, metallic = (
         decode_texels(maps[f"map_{key}"][..., 0]) if f"map_{key}" in maps else float(entry.get(key, plain))
         for key, plain in (("pr", shiny), ("pm", 0))
@@ -206,8 +227,10 @@ def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> tuple[str, np.nda
     if "map_d" in entry:
         if map_d is None:
             return "map_d", np.ones(()), assets.MOSTLY_OPAQUE
-        # grey, or the alpha of a picture that has one
-        return "map_d", decode_texels(map_d[..., 3 if map_d[..., 3].min() < 255 else 0]), assets.MOSTLY_OPAQUE
+        # a grey picture, or the alpha of another, which is opaque where it has none
+        own = entry["map_d"] != entry.get("map_kd") and np.ptp(map_d[..., :3].astype(int), axis=-1).max() <= NEARLY_GREY
+        alpha = map_d[..., 0 if own and map_d[..., 3].min() == 255 else 3]
+        return "map_d", decode_texels(alpha), assets.MOSTLY_OPAQUE
     if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
         return f"d {opacity:g}", np.asarray(opacity), None
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:

@@ -25,7 +25,18 @@ from typing import Any, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import ARRAYS, NORMAL, PLACES, Columns, Report, list_names, name_columns, plain_name
+from spnr_jax.formats.columns import (
+    ARRAYS,
+    NORMAL,
+    PLACES,
+    POSITION,
+    Columns,
+    Report,
+    list_names,
+    name_columns,
+    name_places,
+    plain_name,
+)
 
 Line = tuple[int, str]  # its number in the file, from 1, and its text
 
@@ -33,6 +44,7 @@ COLOR = ("r", "g", "b")
 OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
 NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
+LUMINANCE, CLOSE = np.array([0.299, 0.587, 0.114]), 0.15  # of sRGB (BT.601); of correlations that tell too little
 PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
 MOST_LINES, MOST_COLUMNS = 99, 16  # before the numbers, in which names are looked for; of a table without names
@@ -111,7 +123,7 @@ def _unquote(text: str) -> str:
 
 def _words(line: str) -> list[str]:
     """The fields of a line, between the separators that it has."""
-    return [word.strip("' \t") for word in line.split(next((mark for mark in ";," if mark in line), None))]
+    return [word.strip("' \t") for word in line.split(next((mark for mark in ";,\t" if mark in line), None))]
 
 
 def _is_number(word: str) -> bool:
@@ -159,7 +171,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
 
 
 def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
-    """Names of the columns of a table by a line before it that names x, else by the numbers."""
+    """Names of the columns of a table by a line before it that names places, else by the numbers."""
     count, filled = table.shape[1], 1 + int(np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2))
     found: list[list[str]] = []
     unfit: list[str] = []
@@ -169,11 +181,11 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
         while len(names) > filled and not names[-1]:
             names.pop()
         is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
-        if filled <= len(names) <= count and ("x" in names or not is_remark):
+        if filled <= len(names) <= count and (name_places(names) or not is_remark):
             found.append(names)
         elif "x" in names and not is_remark:
             unfit = unfit or names
-    if names := next((names for names in found if "x" in names), [*found, []][0]):
+    if names := next(filter(name_places, found), [*found, []][0]):
         names += [""] * (count - len(names))  # separators behind the last number
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
     if len(unfit) == count - 1 and len(table) > 1 and (np.diff(table[:, 0]) == 1).all():  # as R writes a table
@@ -192,7 +204,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     The first three that can be normals; of the others those three that are most alike of what can be colours.
     """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
-    if count < 3 or count == 5 or count > MOST_COLUMNS:
+    if count < 3 or count > MOST_COLUMNS:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of x y z "
             "(then intensity, r g b, nx ny nz, roughness metallic), or a header line that names the columns"
@@ -206,13 +218,15 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         return (*first * [INDEX], *plain_names(table[:, first:], report))
     if (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
-    names, threes = [*"xyz", *["scalar"] * (count - 3)], range(3, count - 2)
+    names, threes, close = [*"xyz", *["scalar"] * (count - 3)], range(3, count - 2), list[int]()
     for i in [i for i in threes if _are_normals(table[:, i : i + 3], table[:, :3])][:1]:
         names[i : i + 3] = NORMAL
-    free = [i for i in threes if names[i : i + 3] == 3 * ["scalar"]]
+    free = [i for i in threes if names[i : i + 3] == 3 * ["scalar"] and not (table[:, i : i + 3] < 0).any()]
     if colored := [i for i in free if _are_colors(table[:, i : i + 3])] or free:
-        start = max(colored, key=lambda i: _likeness(table[:, i : i + 3])) if len(table) > 2 else colored[0]
+        alike = {i: _likeness(table, i) if len(table) > 2 else 0.0 for i in colored}
+        start = max(colored, key=alike.__getitem__)
         names[start : start + 3] = COLOR
+        close = [i for i in colored if i != start and 0 < alike[start] - CLOSE < alike[i]]
         rest, left = table[:, start + 3 :], count - start - 3
         share = rest.min(initial=0) >= 0 and rest.max(initial=0) <= 1 and not np.all(rest % 1 == 0)
         if left == 1 and (np.isin(rest, OPAQUE).all() or (share and table[:, 3:].max() <= 1 and np.median(rest) == 1)):
@@ -222,7 +236,8 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     if names[3:4] == ["scalar"]:
         names[3] = "intensity"
     if count > 3:
-        report(f"the {count} columns, which have no names, taken as {' '.join(names)}")
+        doubt = f"; r g b may as well be columns {close[0] + 1} to {close[0] + 3}: name them in a first line" if close else ""
+        report(f"the {count} columns, which have no names, taken as {' '.join(names)}{doubt}")
     return tuple(names)
 
 
@@ -241,8 +256,16 @@ def _are_colors(values: np.ndarray) -> bool:
 
 
 @np.errstate(invalid="ignore")  # of a constant column
-def _likeness(values: np.ndarray) -> float:
-    """The smaller correlation of neighbouring columns of three (n, 3); 0 where one is constant."""
+def _likeness(table: np.ndarray, start: int) -> float:
+    """The smaller correlation of neighbouring columns of the three from `start`; 0 where one is constant.
+
+    Above any correlation where a column beside them is their luminance.
+    """
+    values = np.asarray(table[:, start : start + 3], np.float64)
+    luminance, rounding = values @ LUMINANCE, 1.5 if values.max() > 2 else 0.006
+    for beside in {start - 1, start + 3} & {*range(3, table.shape[1])}:
+        if np.ptp(table[:, beside]) and np.median(np.abs(table[:, beside] - luminance)) <= rounding:
+            return 2.0
     correlation = np.abs(np.corrcoef(values.T))
     return max(0.0, round(float(np.min([correlation[0, 1], correlation[1, 2]])), 1))
 
@@ -335,6 +358,10 @@ def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
         table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
         columns = dict(zip(plain_names(table, report), table.T, strict=True))
+        of_points = {other: x for other, x in arrays.items() if other not in POSITION and np.shape(x)[:1] == (len(table),)}
+        if others := [other for other in arrays if other not in of_points]:
+            report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
+        arrays = of_points
     columns |= name_columns(arrays)
     if len({len(column) for column in columns.values()}) > 1:
         raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")

@@ -9,6 +9,7 @@
 
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,8 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     texcoords = _texcoords(vertices, lists, corners, sizes)
     images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
     if texcoords is not None and images and all(image is not None for image in images):
-        return _textured(stack_columns(useful(vertices))[corners], sizes, texcoords, of_faces.get("texnumber"), images)
-    if texcoords is not None or "texcoord" in lists:
+        return _textured(useful(vertices), corners, sizes, texcoords, of_faces.get("texnumber"), images)
+    if texcoords is not None or "texcoord" in lists or header.textures or any("texture" in name for name, *_ in header.elements):
         loading.ignored.add("texture coordinates")
     return _colored(vertices, corners, sizes, of_faces, loading)
 
@@ -60,16 +61,27 @@ def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.n
 
 
 def _textured(
-    positions: np.ndarray, sizes: np.ndarray, texcoords: np.ndarray, number: np.ndarray | None, images: list
+    vertices: Columns,
+    corners: np.ndarray,
+    sizes: np.ndarray,
+    texcoords: np.ndarray,
+    number: np.ndarray | None,
+    images: list,
 ) -> list[Part]:
-    """A part for each image of polygons of so many corners at `positions` (corners, 3), numbered by their image."""
+    """A part for each image of polygons of so many corners, each with its own texture coordinates (corners, 2).
+
+    `number` is that of each polygon's image.
+    """
+    positions = stack_columns(vertices)[corners]
+    normals = stack_columns(vertices, NORMAL)[corners] if set(NORMAL) <= vertices.keys() else None
     faces, owner = triangulate(positions, np.arange(len(positions)), sizes)
     number = np.zeros(len(owner)) if number is None else number[owner]
     texcoords = texcoords * [1, -1] + [0, 1]
     parts = []
     for i, image in enumerate(images):
         material = make_material(decode_texels(image[..., :3], SRGB_TABLE))
-        parts.append(Part(positions=positions, faces=faces[number == i], material=material, texcoords=texcoords))
+        part = Part(positions=positions, faces=faces[number == i], material=material, texcoords=texcoords)
+        parts.append(replace(part, normals=normals))
     return parts
 
 
@@ -95,7 +107,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
             loading.say(f"the header announces {announced} triangles, {held} stand behind it, {read} are read")
         rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
         corners = rows["corners"]
-        loading.ignored |= {"STL attribute bytes"} if rows["attribute"].any() else set()
+        loading.ignored |= {"colours in STL"} if rows["attribute"].any() or b"COLOR=" in data[:80] else set()
     columns = dict(zip("xyz", corners.reshape(-1, 3).T, strict=True))
     return _colored(columns, np.arange(corners.size // 3), np.full(corners.size // 9, 3), {}, loading)
 
@@ -144,7 +156,7 @@ def _colored(
         loading.ignored.add("roughness and metallic of vertices")
     alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
     if colors is None and (found := colors_of(rename(of_faces))) is not None:
-        positions, normals, alpha = positions[faces.ravel()], None, None if alpha is None else alpha[faces.ravel()]
+        positions, normals, alpha = (None if x is None else x[faces.ravel()] for x in (positions, normals, alpha))
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
     material = make_material(0.5 if colors is None else 1.0)

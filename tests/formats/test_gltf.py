@@ -53,6 +53,36 @@ def test_normals_are_those_of_the_faces_however_a_node_stretches_and_mirrors_the
         np.testing.assert_allclose(normals / np.linalg.norm(normals, axis=1)[:, None], part.normals[[0, 0]], atol=1e-6)
 
 
+QUARTER = [-(0.5**0.5), 0, 0, 0.5**0.5]  # a turn about x, by which y up becomes z up
+
+
+@pytest.mark.parametrize("node", [{}, {"translation": [7, 0, 0], "scale": [3, 1, 1]}])
+def test_a_skin_lies_where_its_joints_put_it_whatever_its_own_node_says(tmp_path, node):
+    inverse = np.diag([2.0, 2, 2, 1])
+    inverse[:3, 3] = [0, 0, 1]
+    asset = load_mesh(skinned(armature={"scale": [10] * 3, "rotation": QUARTER}, inverse=inverse, **node).write(
+        tmp_path / "skin.glb"
+    ))  # fmt: skip
+    (part,) = asset.parts
+    assert corners_in_space(part) == {(20 * x, 10, -20 * y) for x, y, _ in CORNERS}
+    np.testing.assert_allclose(part.normals, [[0, 1, 0]] * 4, atol=1e-6)
+    assert not asset.ignored
+
+
+def test_instances_are_drawn_each_in_its_place_and_hidden_nodes_with_their_children_are_not(tmp_path):
+    builder = GltfBuilder(extensionsRequired=["EXT_mesh_gpu_instancing"])
+    moves = {"TRANSLATION": np.float32([[1, 0, 0], [0, 5, 0]]), "ROTATION": np.array([[0, 0, 0, 127], [0, 127, 0, 0]], "i1")}
+    attributes = {name: builder.accessor(values) for name, values in moves.items()}
+    builder.document["accessors"][-1]["normalized"] = True
+    instances = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
+    builder.mesh(builder.primitive(), scale=[2, 2, 2], **instances)
+    child = builder.mesh(builder.primitive(CORNERS * 9), root=False)
+    builder.node(children=[child], extensions={"KHR_node_visibility": {"visible": False}})
+    (part,) = load_mesh(builder.write(tmp_path / "a.glb")).parts
+    moved = {(2 * x + 2, 2 * y, 0) for x, y, _ in CORNERS} | {(-2 * x, 2 * y + 10, 0) for x, y, _ in CORNERS}
+    assert corners_in_space(part) == moved
+
+
 def test_parts_with_equal_materials_merge_and_others_stay_apart(tmp_path):
     builder = GltfBuilder()
     for number, (name, color) in enumerate((("a", [1, 0, 0, 1]), ("c", [0, 0, 1, 1]), ("b", [1, 0, 0, 1]))):
@@ -91,6 +121,24 @@ def test_quantised_and_strided_positions_are_decoded(tmp_path):
 # What is refused
 
 
+def skinned(joints=((0, 0, 0, 0),) * 4, armature=None, inverse=None, **node) -> GltfBuilder:
+    """A scene of a square that hangs on one joint of a moved armature, half of its weights written."""
+    builder = GltfBuilder()
+    weights = np.tile(np.float32([0.5, 0, 0, 0]), (4, 1))
+    primitive = builder.primitive(JOINTS_0=np.array(joints, np.uint8), WEIGHTS_0=weights, NORMAL=CORNERS * 0 + FACING)
+    builder.mesh(primitive, skin=0, **node)
+    joint = builder.node(root=False, name="hip")
+    builder.node(children=[joint], **(armature or {}))
+    skin = {"joints": [joint]}
+    if inverse is not None:
+        skin["inverseBindMatrices"] = builder.accessor(np.float32(inverse).T.reshape(1, 16))
+    builder.document["skins"] = [skin]
+    return builder
+
+
+FACING = np.float32([0, 0, 1])
+
+
 def repeat(document):
     document["nodes"] += [{"mesh": 0}] * 300
     document["scenes"][0]["nodes"] = list(range(301))
@@ -102,7 +150,8 @@ REFUSED = (
     (glass(alphaMode="BLEND"), "is transparent: material 'glass' has alphaMode BLEND"),
     (glass(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),
     (glass(extensions=TRANSMISSION), "KHR_materials_transmission"),
-    *((square(GltfBuilder(extensionsRequired=[x])), x) for x in ("EXT_mesh_gpu_instancing", "ABC_unheard_of")),
+    (square(GltfBuilder(extensionsRequired=["ABC_unheard_of"])), "ABC_unheard_of"),
+    (skinned(joints=[[1, 0, 0, 0]] * 4), "joint 1 of 1"),
     (square(change=lambda d: d["accessors"][0].pop("bufferView")), "accessor 0 is sparse or holds no data"),
     (square(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
     (square(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
@@ -215,13 +264,13 @@ def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
 
 
 def test_what_is_not_modelled_is_named(tmp_path):
-    builder = GltfBuilder(animations=[{"channels": []}], extensionsUsed=["EXT_mesh_gpu_instancing"])
+    builder = GltfBuilder(animations=[{"channels": []}], extensionsUsed=["KHR_lights_punctual"])
     texture, sheen = {"index": builder.texture(CHECKER)}, {"KHR_materials_sheen": {}}
     more = {"normalTexture": texture, "occlusionTexture": texture, "emissiveFactor": [0, 0.1, 0], "extensions": sheen}
     material = builder.material(**more)
     builder.mesh(builder.primitive(indices=SQUARE[:4], mode=1))
     asset = one_square(tmp_path, builder, material=material)
-    named = ["EXT_mesh_gpu_instancing", "KHR_materials_sheen", "LINES primitives", "animations", "emissive"]
+    named = ["KHR_lights_punctual", "KHR_materials_sheen", "LINES primitives", "animations", "emissive"]
     assert asset.ignored == (*named, "normalTexture", "occlusionTexture")
 
 

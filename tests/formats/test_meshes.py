@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder
+from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, png
 from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent, obj_leaf, refusal, write_obj
 
 from data_gen.plan.sources import find_meshes
@@ -156,6 +156,7 @@ LINEAR = srgb_to_linear(CHECKER / 255)
 PLACEHOLDER = "Kd 0.8 0.8 0.8\nmap_Kd -s 2 -.5 1e-1 -clamp on 3d wood.png"
 LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ignored
     (PLACEHOLDER, (LINEAR, 0.5, 0, "clamp"), ("MTL Kd beside map_Kd", "MTL map option -s")),
+    ("Kd 0.1 0.2 0.3\nNs 98\nKs 0 0 0", (np.float32([0.1, 0.2, 0.3]), 0.5, 0, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10", (np.float32([0.1, 0.2, 0.3]), 0.25, 0.75, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nNs 98\nd 1\nTr 0", (np.float32([0.1, 0.2, 0.3]), np.sqrt(2 / 100), 0, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nTr 1.000\nd 1.0", (np.float32([0.1, 0.2, 0.3]), 0.5, 0, "repeat"), ()),
@@ -169,6 +170,52 @@ def test_an_opaque_material_has_its_colour_or_texture_and_its_roughness(tmp_path
     np.testing.assert_allclose(look.base_color, color, rtol=0, atol=1e-6 if color.ndim > 1 else 0)
     np.testing.assert_allclose([look.roughness, look.metallic], [roughness, metallic], rtol=1e-6)
     assert (look.wrap, asset.ignored) == (wrap, ignored)
+
+
+@pytest.mark.parametrize(("head", "shininess"), [("# Blender 4.1.1 MTL File: 'None'", 1000), ("# Blender MTL File: ''", 900)])
+def test_the_roughness_of_blenders_files_is_the_one_that_it_wrote_them_from(tmp_path, head, shininess):
+    for roughness in (0.2, 0.5, 1):
+        text = f"{head}\nnewmtl paint\nNs {shininess * (1 - roughness) ** 2:.6f}\n"
+        look = load_mesh(write_obj(tmp_path, PAINTED, text)).parts[0].material
+        assert look.roughness == pytest.approx(roughness, abs=1e-6)
+
+
+MASKS = {  # a picture of map_d; whether the half of it that is dark is cut out
+    "opaque colours": (CHECKER, False),
+    "grey": (np.repeat(np.where(np.arange(6) < 3, 0, 255)[None, :, None], 3, axis=2).repeat(4, axis=0), True),
+    "alpha": (np.dstack([CHECKER, np.where(np.arange(6) < 3, 0, 255) * np.ones((4, 1))]), True),
+}
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_a_mask_is_the_alpha_of_a_picture_or_a_grey_one(tmp_path, mask):
+    texels, cuts = MASKS[mask]
+    path = write_obj(tmp_path, TEXTURED, "newmtl paint\nmap_Kd pine.png\nmap_d mask.png\n")
+    (tmp_path / "mask.png").write_bytes(png(texels))
+    opacity = load_mesh(path, transparent_parts="opaque").parts[0].material.opacity
+    assert (opacity is not None) == cuts
+    assert not cuts or ((opacity[:, :3] < 0.5).all() and (opacity[:, 3:] > 0.5).all())
+
+
+def test_two_libraries_in_one_line_and_vertices_of_which_some_have_a_colour_are_read(tmp_path):
+    for name, color in (("one", "1 0 0"), ("two", "0 0 1")):
+        (tmp_path / f"{name} 1.mtl").write_text(f"newmtl {name}\nKd {color}\n")
+    text = "mtllib one 1.mtl two 1.mtl\n" + VERTICES + "usemtl one\nf 1 2 3\nusemtl two\nf 1 3 4\n"
+    parts = load_mesh(write_obj(tmp_path, text)).parts
+    assert {tuple(part.material.base_color) for part in parts} == {(1, 0, 0), (0, 0, 1)}
+    mixed = VERTICES.replace("0 0 0", "0 0 0 1 0 0 # red") + "v -nan(ind) 0 0\nf 1 2 3\nf 1 3 4\nf 1 2 5\n"
+    asset = load_mesh(write_obj(tmp_path, mixed), transparent_parts="opaque")
+    np.testing.assert_array_equal(asset.parts[0].colors, [[1, 0, 0], *3 * [[1, 1, 1]]])
+    assert any("4 of 5 vertices have no colour" in note for note in asset.notes)
+
+
+def test_an_image_that_cannot_be_read_leaves_plain_values_for_pictures(tmp_path):
+    path = write_obj(tmp_path, TEXTURED, "newmtl paint\nKd 0 0.5 0\nmap_Kd light.exr\n")
+    (tmp_path / "light.exr").write_bytes(b"v/1\1" + bytes(99))
+    asset = load_mesh(path, transparent_parts="opaque")
+    np.testing.assert_array_equal(asset.parts[0].material.base_color, [0, 0.5, 0])
+    assert any("cannot be read: light.exr (is not an image)" in note for note in asset.notes)
+    assert "light.exr" in refusal(path)
 
 
 def test_two_materials_with_odd_names_make_two_parts(tmp_path):

@@ -89,6 +89,7 @@ PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
 WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
 PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ascii\n"
+NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
@@ -111,6 +112,8 @@ TEXTS = {
     "names behind %": ("a.txt", "% b g r z y x\n" + table(" ", columns=BACKWARDS)),
     "a name twice": ("a.csv", "x,y,z,r,g,b,x\n" + table(",", columns=PCV)),
     "ParaView": ("a.csv", '"RGB:0","RGB:1","RGB:2",Points:0,Points:1,Points:2\n' + table(",", columns=PARAVIEW)),
+    "names of a map behind a mark": ("a.txt", "#N,E,Elev,R,G,B\n" + table(",", columns=NORTHING)),
+    "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
     "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
     "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
@@ -178,6 +181,24 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
 
+MOVING = np.column_stack([BALL, np.roll(BALL, 1, axis=0) * np.arange(1, 4)])
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_path, first):
+    colors = np.random.default_rng(0).integers(0, 256, (420, 1)) // [1, 2, 4]
+    grey = np.round(colors @ [0.299, 0.587, 0.114])[:, None]
+    rows = np.column_stack([BALL, grey, colors] if first else [BALL, colors, grey])
+    cloud, _ = read(write(tmp_path, "a.txt", table(" ", columns=rows)))
+    np.testing.assert_allclose(cloud.base_color, SRGB[colors], atol=1e-4)
+
+
+def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
+    four = 0.9 * np.random.default_rng(0).integers(0, 256, (420, 1)) + np.random.default_rng(1).uniform(0, 25, (420, 4))
+    _, lines = read(write(tmp_path, "a.txt", table(" ", columns=np.column_stack([BALL, np.round(four)]))))
+    assert "r g b may as well be columns 5 to 7: name them in a first line" in lines[0]
+
+
 @pytest.mark.parametrize(
     ("name", "data", "line"),
     [
@@ -186,6 +207,12 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
+        (
+            "a.npz",
+            pack_arrays({"points": BALL, "y": np.arange(420) % 4, "rgb": np.zeros(3)}),
+            "arrays that are not used, which name no column of the 420 points: y, rgb",
+        ),
+        ("a.txt", table(" ", columns=MOVING), "the 6 columns, which have no names, taken as x y z intensity scalar scalar"),
     ],
 )
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
@@ -400,7 +427,7 @@ def archive(member: bytes) -> bytes:
 PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
-LENGTHS = pack_arrays({"points": np.zeros((5, 3)), "rgb": np.zeros((4, 3))})
+LENGTHS = pack_arrays({"x": np.zeros(5), "y": np.zeros(4), "z": np.zeros(5)})
 KNOWN = "expected one of .ply .pcd .xyz .txt .csv .tsv .asc .pts .npz .npy .las .laz"
 REFUSED = [
     ("a.ply", None, "no such file"),
@@ -418,7 +445,7 @@ REFUSED = [
     ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
     ("a.xyz", "0 0 1e39\n", "too large a number"),
     ("a.csv", "u,v,w\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found u v w"),
-    ("a.xyz", "0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
+    ("a.xyz", "x y z r g b\n0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
     ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
     ("a.xyz", "0 0 0 3 4 66000\n", "from .* to 1.0"),
     ("a.xyz", "1 2 3\n" * 5, "holds 5 points in 1 place: no object"),
@@ -446,7 +473,7 @@ REFUSED = [
     ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
     ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found x"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
-    ("a.xyz", "1 2 3 4 5\n", r"shape \(1, 5\)"),
+    ("a.xyz", "1 2 3 " * 6 + "\n", r"shape \(1, 18\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
     ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", "line 2: expected 3 numbers, found '1,2m,3'"),
     ("a.csv", "x,y,z\n0,5,1,5,2,5\n", "names 3 columns .* above 6 .*; decimal commas need another separator"),
@@ -460,9 +487,9 @@ REFUSED = [
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
     ("a.npz", POINTS.replace(bytes(80), bytes(79) + b"1", 1), "truncated .*CRC"),
-    ("a.npz", pack_arrays({"points": np.zeros((5, 5))}), r"numbers of shape \(5, 5\)"),
+    ("a.npz", pack_arrays({"points": np.zeros((5, 2))}), r"numbers of shape \(5, 2\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
-    ("a.npz", LENGTHS, "different lengths.*'x': 5.*'rgb:0': 4"),
+    ("a.npz", LENGTHS, "different lengths.*'x': 5.*'y': 4"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
     ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "truncated"),
     ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "Object arrays cannot be loaded"),

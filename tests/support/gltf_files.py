@@ -10,7 +10,7 @@ from PIL import Image
 from spnr_jax.formats.meshes import load_mesh
 
 COMPONENT = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)  # a square that faces +z
 SQUARE = np.array([0, 1, 2, 0, 2, 3], np.uint16)
 
