@@ -48,6 +48,7 @@ def parse(arguments: list[str]) -> Command:
     """
     source, arguments = take_option(arguments, "--methods")
     if source is not None:
+        runtime.hide_false_alarms()  # it may import JAX
         methods.include(source)
     train = Annotated[Train, tyro.conf.subcommand("train", default=_train_defaults(arguments))]
     names = [record.__name__.lower() for record in get_args(Command)]

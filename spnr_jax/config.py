@@ -26,6 +26,7 @@ Quality = Literal["draft", "balanced", "best", "trained"]
 Material = Literal["base_color", "roughness", "metallic"]
 MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
+MOST_PIXELS = 2**14  # along a side of a picture
 LARGEST = 2**63  # of any number in a config
 
 

@@ -220,6 +220,7 @@ class Encoder(nn.Module):
             x = nn.relu(x) if number else x
             x = Dense(width, name=f"point_{number}")(x)
         x = jnp.max(x, axis=1, where=mask[..., None], initial=jnp.finfo(x.dtype).min)
+        x = jnp.where(jnp.any(mask, axis=1)[:, None], x, 0)  # of no points
         x = nn.relu(Dense(c.hidden_width, name="hidden")(x))
         return Dense(c.code_size, name="mean")(x), Dense(c.code_size, QUIET, name="log_variance")(x)
 

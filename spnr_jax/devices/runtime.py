@@ -109,12 +109,8 @@ def cache_folder() -> Path:
 
 
 def cache_programs() -> None:
-    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache.
-
-    On some processors, XLA logs two long errors for each program that it reads, though nothing is wrong
-    (openxla/xla#44565).  They are hidden if JAX is not imported yet; TF_CPP_MIN_LOG_LEVEL=2 shows them.
-    """
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
+    hide_false_alarms()
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
@@ -122,6 +118,14 @@ def cache_programs() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
     with suppress(OSError):  # there is none yet, or it is not ours to mend
         remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))
+
+
+def hide_false_alarms() -> None:
+    """Hides errors that XLA logs on some processors for each program that it reads, though nothing is wrong.
+
+    openxla/xla#44565.  Call it before JAX is imported; TF_CPP_MIN_LOG_LEVEL=2 shows them.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def remove_broken(cache: Path) -> None:

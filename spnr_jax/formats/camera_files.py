@@ -2,7 +2,8 @@
 
 `frames` hold a `transform_matrix` each: camera to world, OpenGL axes (x right, y up, looking along -z).  Intrinsics are
 those of the frame or of the whole file: `w` and `h` in pixels, `fl_x` or `camera_angle_x`, and optionally `fl_y`, `cx`
-and `cy`.  Cameras are pinholes: lens distortion is not drawn.
+and `cy`.  With `camera_angle_x` alone, as of the original NeRF, pictures are square.  Cameras are pinholes: lens
+distortion is not drawn.
 """
 
 import json
@@ -12,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from spnr_jax.config import MOST_PIXELS
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cameras import is_rotation
 from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
-MOST_PIXELS = 2**14  # along a side
+SIZE = 512  # pixels along each side where a file tells none
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
 
 
@@ -27,13 +29,15 @@ def read_cameras(
     *,
     rotation: np.ndarray | None = None,
     origin: np.ndarray | None = None,
+    size: int = SIZE,
     report: Callable[[str], None] = lambda line: None,
 ) -> list[Camera]:
     """The cameras of a file, in its frame or, if given, in that of rotation @ (position - origin).
 
-    `report` gets a line if lens distortion is left out.  ValueError, one line that names the file, if it has none.
+    `size`: pixels along each side where the file has neither `w` nor `h`.  `report` gets a line if lens distortion is
+    left out.  ValueError, one line that names the file, if it has none.
     """
-    return cameras_of(read_document(path, report), rotation, origin)
+    return cameras_of(read_document(path, report), rotation, origin, size)
 
 
 def read_document(path: str | Path, report: Callable[[str], None] = lambda line: None) -> Mapping[str, Any]:
@@ -55,14 +59,20 @@ def read_document(path: str | Path, report: Callable[[str], None] = lambda line:
 
 
 def cameras_of(
-    document: Mapping[str, Any], rotation: np.ndarray | None = None, origin: np.ndarray | None = None
+    document: Mapping[str, Any],
+    rotation: np.ndarray | None = None,
+    origin: np.ndarray | None = None,
+    size: int = SIZE,
 ) -> list[Camera]:
     """The cameras of a file's content, float32; KeyError for a missing entry, Type- or ValueError for a wrong one."""
     turn, place = np.eye(3) if rotation is None else rotation, np.zeros(3) if origin is None else origin
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise UserError("no frames")
-    return [_camera({**document, **frame}, number, turn, place) for number, frame in enumerate(frames)]
+    entries = ({**document, **frame} for frame in frames)
+    square = {"w": size, "h": size}
+    sized = (square | of if not square.keys() & of.keys() and "camera_angle_x" in of else of for of in entries)
+    return [_camera(of, number, turn, place) for number, of in enumerate(sized)]
 
 
 @np.errstate(all="ignore")  # of numbers that leave float32, which are infinite then, and refused

@@ -97,8 +97,9 @@ class Reading:
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {value!r}")
-        if self.num_points is not None and self.num_points < 1:
-            raise UserError(f"num_points must be at least 1, got {self.num_points}")
+        for name, value, least in (("num_points", self.num_points, 1), ("seed", self.seed, 0)):
+            if value is not None and not (isinstance(value, int | np.integer) and value >= least):
+                raise UserError(f"{name} must be a whole number of at least {least}, got {value}")
 
 
 def read_cloud(

@@ -43,8 +43,9 @@ COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
-def write_splats(path: Path, gaussians: Gaussians, note: str = "") -> int:
+def write_splats(path: str | Path, gaussians: Gaussians, note: str = "") -> int:
     """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for others."""
+    path = Path(path)
     check_suffix(path)
     content = ply_of(gaussians, note) if path.suffix.lower() == ".ply" else spz_of(gaussians)
     write_whole(path, content)

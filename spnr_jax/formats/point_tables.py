@@ -236,7 +236,11 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     if names[3:4] == ["scalar"]:
         names[3] = "intensity"
     if count > 3:
-        doubt = f"; r g b may as well be columns {close[0] + 1} to {close[0] + 3}: name them in a first line" if close else ""
+        doubt = (
+            f"; r g b may as well be columns {close[0] + 1} to {close[0] + 3}: name them in a first line"
+            if close
+            else ""
+        )
         report(f"the {count} columns, which have no names, taken as {' '.join(names)}{doubt}")
     return tuple(names)
 
@@ -358,7 +362,9 @@ def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
         table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
         columns = dict(zip(plain_names(table, report), table.T, strict=True))
-        of_points = {other: x for other, x in arrays.items() if other not in POSITION and np.shape(x)[:1] == (len(table),)}
+        of_points = {
+            other: x for other, x in arrays.items() if other not in POSITION and np.shape(x)[:1] == (len(table),)
+        }
         if others := [other for other in arrays if other not in of_points]:
             report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
         arrays = of_points

@@ -100,11 +100,14 @@ def orbit(
     distance: float | Float[Array, ""],
     centre: Float[Array, "3"],
 ) -> Float[Array, "3 4"]:
-    """Pose that looks at `centre` from a distance; radians: azimuth around y from +z, elevation above the xz plane."""
-    horizontal = jnp.cos(elevation)
-    direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
-    # from straight above or below, up in the picture is towards the back of the object
-    up = jnp.where(horizontal > 1e-6, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, -1.0]) * jnp.sign(elevation))
+    """Pose that looks at `centre` from a distance; radians: azimuth around y from +z, elevation above the xz plane.
+
+    Poses are continuous over the poles; beyond them the object stands on its head.
+    """
+    horizontal, east, south = jnp.cos(elevation), jnp.sin(azimuth), jnp.cos(azimuth)
+    direction = jnp.stack([horizontal * east, jnp.sin(elevation), horizontal * south])
+    beside = -jnp.sign(elevation) * jnp.stack([east, jnp.zeros_like(east), south])  # up where y is along the view
+    up = jnp.where(jnp.abs(horizontal) > 1e-6, jnp.sign(horizontal) * jnp.array([0.0, 1.0, 0.0]), beside)
     return look_at(centre + distance * direction, centre, up)
 
 

@@ -108,6 +108,8 @@ def make_cloud(
         wanted = shape if name in VECTORS else shape[:1]
         if np.shape(values) not in (wanted, wanted[1:], ()):
             raise UserError(f"make_cloud: {name} has the shape {np.shape(values)}, expected {wanted}")
+        if name == "base_color" and np.issubdtype(getattr(values, "dtype", float), np.integer):
+            raise UserError("make_cloud: base_color holds whole numbers; expected linear floats from 0 to 1")
         return xp.broadcast_to(xp.asarray(values, kind), wanted)
 
     return PointCloud(
@@ -243,7 +245,7 @@ SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: mult
 def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
     """Columns of at most `most` rows of all pieces, each with the same chance, and the total number of rows.
 
-    All rows if there are no more than that, otherwise at least half of `most`.  Whether a row is kept depends only on
+    All rows if there are no more than that, otherwise about half of `most` or more.  Whether a row is kept depends only on
     its number.  At any time, only the kept rows and one piece are in memory.
     """
     kept: Columns = {}

@@ -174,7 +174,7 @@ class Light:
         """The light with its radiance multiplied by a factor."""
         if isinstance(factor, Light):
             return NotImplemented
-        return Light(tables=factor * self.tables)
+        return Light(tables=(factor * self.tables).astype(self.tables.dtype))  # of NumPy's numbers, which are double
 
     __rmul__ = __mul__
 
@@ -191,7 +191,7 @@ class Light:
         tables = xp.asarray(self.tables)
         columns = -degrees / 360 * tables.shape[-2]  # columns run against the azimuth
         whole = xp.floor(columns)
-        part = columns - whole
+        part = xp.asarray(columns - whole, tables.dtype)
         # indices: jnp.roll would be compiled for every shift
         places = xp.arange(tables.shape[-2]) - whole.astype(int)
         near, far = (tables[..., (places - i) % len(places), :] for i in (0, 1))

@@ -432,6 +432,9 @@ def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "po
         mask=extend(cloud.mask, select_points(nodes, neighbors, candidates, learned)),
         normals=extend(nodes.normal, learned.normal),
         materials_known=None if cloud.materials_known is None else extend(cloud.materials_known),
-        learned=extend(jnp.zeros_like(nodes.spacing), 1 - jax.nn.sigmoid(learned.logit) / 2),
+        learned=extend(
+            jnp.zeros_like(nodes.spacing) if cloud.learned is None else cloud.learned,
+            1 - jax.nn.sigmoid(learned.logit) / 2,
+        ),
         evenness=jnp.full((1 + CANDIDATES) * len(nodes.spacing), evenness),
     )

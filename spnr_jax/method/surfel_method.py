@@ -97,8 +97,8 @@ def render(
     weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     common = {
-        of.resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == of.resolution)
-        for of in planned
+        resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == resolution)
+        for resolution in {x.resolution for x in planned}
     }
 
     def draw(view: PlannedView, whole: Camera) -> Rendering:

@@ -45,6 +45,7 @@ COARSEST = 3.5  # pixels between points above which the G-buffer has half the pi
 FINEST = 0.8  # pixels between points below which it has twice the resolution and is averaged
 SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture is small, and its FINEST
 MOST_DOUBLINGS = 4
+NEAREST = 0.5  # distance, in units of the box, at which an eye inside the object sees its points
 STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
 GRID = 16  # a window's corner is a multiple: the network's pooling grid is the same from every camera
 LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
@@ -106,8 +107,10 @@ def check_camera(camera: Camera, where: str) -> None:
     """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
     cloud_arrays.refuse_tracers(camera, where)
     tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
-    if tails != [(3, 4), (3, 3)] or not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
-        raise UserError(f"{where}: expected a finite pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
+    if tails != [(3, 4), (3, 3)]:
+        raise UserError(f"{where}: expected a pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
+        raise UserError(f"{where}: the camera's pose or intrinsics hold NaN or infinity")
     if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
         raise UserError(f"{where}: a focal length of camera.intrinsics is 0 or negative; expected pixels")
     if not cameras.is_rotation(np.asarray(camera.cam_to_world)[..., :3]):
@@ -115,13 +118,13 @@ def check_camera(camera: Camera, where: str) -> None:
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
-    """Doublings by the network, and `side`, from the scene's spacing in pixels at its centre.
+    """Doublings by the network, and `side`, from the scene's spacing in pixels at its centre, not nearer than NEAREST.
 
     `render_scale` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
     """
     eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
-    pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / render_scale / max(distance, 1e-3)
+    pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / render_scale / max(distance, NEAREST)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     finest = FINEST_OF_SMALL if max(camera.height, camera.width) / render_scale <= SMALL else FINEST
     return doublings, 2 if pixels < finest else 1
@@ -230,6 +233,8 @@ def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
     if params is not None and "params" not in params:
         raise UserError(f"render: expected params=model.params, or None; got a dict of {', '.join(params)}")
+    if any(isinstance(size, jax.core.Tracer) for size in jax.tree.leaves(plan)):
+        raise UserError("render: plan is traced, but gives array sizes: jax.jit(render, static_argnames='plan')")
     if not isinstance(plan, Plan):
         raise UserError(f"render: expected plan=spnr_jax.plan(scene, camera), got {type(plan).__name__}")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
@@ -312,9 +317,10 @@ def shade(
     else:
         outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, inputs[None], doublings))
     color, alpha = compose_picture(outputs, maps[None], ambient[None], doublings)
-    depth = depth[None, ..., None]
+    held = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
     for _ in range(doublings):
-        depth = double_size(depth)
+        held = double_size(held)
+    depth = held[..., :1] / larger(held[..., 1:], 1e-6)  # the mean over pixels that have one
     return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
 
 

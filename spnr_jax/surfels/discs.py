@@ -74,7 +74,7 @@ def average_rows(
         return sums + neighbor[1][:, None] * rows, None
 
     empty = jnp.zeros((weight.shape[1], visibility.shape[1]), weight.dtype)
-    return jax.lax.scan(add, empty, (neighbors, weight / sum_first(weight)[None]))[0]
+    return jax.lax.scan(add, empty, (neighbors, weight / larger(sum_first(weight), 1e-9)[None]))[0]
 
 
 def find_farthest(uv: Float[Array, "k 2 block"]) -> Float[Array, "16 block"]:

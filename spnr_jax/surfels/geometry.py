@@ -158,8 +158,8 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> S
     """Surfels of the points of a cloud (unbatched) in the box [-1, 1]^3; pure, differentiable, one structure.
 
     One surfel per point, in the same order; `mask` is False for padding.
-    `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  A given normal may have any
-    length; length 0 means that it is not given.
+    `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  Given normals are scaled to
+    length 1; where one is shorter than 1e-9, none is given.
     """
     mask = jnp.asarray(cloud.mask)
 
@@ -340,10 +340,11 @@ def estimate_visibility(
     spacing: Float[Array, " points"],
 ) -> Float[Array, "64 points"]:
     """Visibility of each point from each of 64 directions."""
-    middle, grid = jnp.asarray(median(spacing, points.mask)), choose_grid(points.mask.shape[0])
+    middle, grid = jnp.asarray(median(spacing, points.mask)), int(choose_grid(points.mask.shape[0]))
+    cell = choose_cell(middle, jnp.sum(points.mask))
     low, high = CONSTANTS.visibility_spacing_bounds
     bounded = jnp.clip(spacing, low * middle, high * middle)
-    return compute_visibility(points.position, normal, bounded, points.mask, choose_cell(middle, grid), grid=grid)
+    return compute_visibility(points.position, normal, bounded, points.mask, cell, grid=grid)
 
 
 def orient_layers(
@@ -464,6 +465,8 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     """
     del params
     check_inputs(cloud, neighbors, "encode")
+    # a cloud that a jitted function closes over is constant: XLA would take seconds to sort it while compiling
+    cloud, neighbors = jax.lax.optimization_barrier((cloud, neighbors))
     inside, centre, scale = normalise_cloud(cloud)
     return make_scene(inside, neighbors, centre, scale)
 

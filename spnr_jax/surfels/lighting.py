@@ -94,7 +94,7 @@ def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
     ValueError for another shape.
     """
     xp, shape = array_namespace(envmap), np.shape(envmap)
-    if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0]:
+    if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or not shape[0]:
         raise UserError(f"light_of: expected a map (height, 2 height, 3), got {shape}")
     if not isinstance(envmap, jax.core.Tracer):
         values = np.asarray(envmap)

@@ -9,12 +9,14 @@ Votes are pure functions of a block of points, the last axis.  A vote is positiv
 flip a normal or keep it, and have no gradient.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import clamp, dot, sum_first
+from spnr_jax.kernels.numerics import array_namespace, clamp, dot, sum_first
 from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on, weigh_distance, weigh_height
 
 # --- visibility -------------------------------------------------------------------------------------------------------
@@ -51,14 +53,15 @@ def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"
 DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
-def choose_grid(count: int) -> int:
+def choose_grid(count: int | Int[Array, ""]) -> Any:
     """Cells along a side of the depth buffers for so many points: CELL spacings wide, if that covers the box."""
-    return int(min(max(16 * -(-(4 * count**0.5) // 16), COARSEST), FINEST))
+    xp = array_namespace(count)
+    return xp.clip(16 * xp.ceil(xp.sqrt(count) / 4), COARSEST, FINEST).astype(int)
 
 
-def choose_cell(spacing: Float[Array, ""], grid: int) -> Float[Array, ""]:
-    """Width of a cell, from the median spacing."""
-    return jnp.maximum(CELL * spacing, BOX / grid)
+def choose_cell(spacing: Float[Array, ""], count: Int[Array, ""]) -> Float[Array, ""]:
+    """Width of a cell, from the median spacing and the number of points, padding not counted."""
+    return jnp.maximum(CELL * spacing, BOX / choose_grid(count))
 
 
 def compute_visibility(

@@ -190,14 +190,16 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     up = -(row + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, smaller(slope, -LEAST_COSINE), larger(slope, LEAST_COSINE))
-    ray_depth = clamp((nx * x + ny * y + nz * z) / slope, -z - 2 * radius, -z + 2 * radius)
+    ray_depth = (nx * x + ny * y + nz * z) / slope
+    ahead = ray_depth > 0  # else the eye is between the disc's plane and the ray, as where it is close to a floor
+    ray_depth = clamp(ray_depth, -z - 2 * radius, -z + 2 * radius)
     there = [RADIUS / radius * x for x in (ray_depth * right - x, ray_depth * up - y, -ray_depth - z)]  # in spacings
     in_plane = _dot(there, there) / RADIUS**2
     along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
     ends = [r[point] - x for r, x in zip(far, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / MIN_RADIUS**2
-    cut = larger(cut - in_plane, RIM_SKIRT * (1 - in_plane))
+    cut = jnp.where(ahead, larger(cut - in_plane, RIM_SKIRT * (1 - in_plane)), 0)
     kernel = clamp(larger(cut, 1 - on_picture), 0, 1)
     depth = clamp(ray_depth, -z - radius, -z + radius)
     pixels = camera.height * camera.width

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import Cut, Schedule, TrainConfig
+from spnr_jax.config import MOST_PIXELS, Cut, Schedule, TrainConfig
 from spnr_jax.errors import UserError, require, require_at_least, require_within
 
 MOST_STOPS = 20
@@ -20,6 +20,12 @@ def changed_options(options: Any) -> tuple[str, ...]:
     """Names of the options that differ from their defaults."""
     changed = (field.name for field in dataclasses.fields(options) if getattr(options, field.name) != field.default)
     return tuple(f"--{name.replace('_', '-')}" for name in changed)
+
+
+def check_resolution(pixels: int | None) -> None:
+    """UserError for a number of pixels along a side that is not drawn."""
+    if pixels is not None and not (16 <= pixels <= MOST_PIXELS and pixels % 4 == 0):
+        raise UserError(f"--resolution must be a multiple of 4 from 16 to {MOST_PIXELS}, got {pixels}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +46,17 @@ class Lighting:
 
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
+        require(self.light != "", "--light: empty; expected a file or a name")
         require(math.isfinite(self.light_yaw), f"--light-yaw must be a number of degrees, got {self.light_yaw}")
+        turned = self.light_yaw and self.sun and not self.light
+        require(not turned, "--light-yaw turns the map of --light, which is not given; --sun has an azimuth of its own")
         if self.sun and not (math.isfinite(self.sun[0]) and -90 <= self.sun[1] <= 90):
             raise UserError(f"--sun: expected an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
         require_within(self, -MOST_STOPS, MOST_STOPS, "exposure")
 
 
+FASTEST_GIF = 50  # frames a second that browsers show
+MOST_VIEWS = 1000  # of a fit
 FEWEST_SPLATS, MOST_SPLATS = 6, 300_000  # that are asked for: one for each side; more than viewers on telephones draw
 
 
@@ -63,7 +74,7 @@ class SplatOptions:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         require_within(self, FEWEST_SPLATS, MOST_SPLATS, "most_splats")
-        require_at_least(self, 4, "fitting_views")
+        require_within(self, 4, MOST_VIEWS, "fitting_views")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +123,7 @@ class Share(ReadOptions):
         if self.out.suffix.lower() not in (".html", ".htm") or self.out.is_dir():
             raise UserError(f"--out {self.out}: expected the name of an .html file")
         require_within(self, -89, 89, "elevation")
+        require(math.isfinite(self.azimuth), f"--azimuth must be a number of degrees, got {self.azimuth}")
         at_white = self.lighting.background == "white"
         require(at_white, "--background light: a page shows its object on white; leave it out")
 
@@ -186,8 +198,9 @@ class Render(ReadOptions):
         require(self.views > 0 or self.turntable != "none", "--views 0 --turntable none: nothing is left to draw")
         require_at_least(self, 1, "frames", "fps")
         require_within(self, -90, 90, "elevation")
-        if self.resolution is not None and (self.resolution < 16 or self.resolution % 4):
-            raise UserError(f"--resolution must be a multiple of 4 of at least 16, got {self.resolution}")
+        check_resolution(self.resolution)
+        if self.turntable == "gif" and self.fps > FASTEST_GIF:
+            raise UserError(f"--fps: a .gif shows at most {FASTEST_GIF} frames a second; take --turntable mp4")
         if self.transparent and self.lighting.background != "white":
             raise UserError("--background light: not together with --transparent; give one of them")
 
@@ -260,6 +273,7 @@ class Export:
     def __post_init__(self) -> None:
         """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
+        check_resolution(self.resolution)
         changed = changed_options(self)
         of_cloud = [name for name in changed if name in ("--network", "--up", "--clean")]
         of_cloud += [*changed_options(self.lighting), *changed_options(self.making)]

@@ -25,6 +25,7 @@ import base64
 import html
 import io
 import json
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import resources
@@ -140,7 +141,7 @@ def page(
     parts = {
         "TITLE": html.escape(title),
         "NOTE": html.escape(note),
-        "NAME": html.escape(Path(title).stem or "splats"),
+        "NAME": html.escape(re.sub(r'[\x00-\x1f/\\:*?"<>|]+', "_", title).strip(" .") or "splats"),
         "POSTER": "data:image/jpeg;base64," + base64.b64encode(jpeg.getvalue()).decode(),
         "CAMERA": json.dumps(start | {"view": float(np.rad2deg(FIELD_OF_VIEW))}),
         "DATA": base64.b64encode(spz_of(gaussians)).decode(),

@@ -28,7 +28,7 @@ from PIL import Image
 from spnr_jax.devices.runtime import run_ahead
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
-from spnr_jax.formats.camera_files import cameras_of, describe_cameras, read_document
+from spnr_jax.formats.camera_files import SIZE, cameras_of, describe_cameras, read_document
 from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
@@ -42,7 +42,7 @@ from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.surfaces import surface_depth
 from spnr_jax.training.weights import load
 
-SUN = (1.6, 1.5, 1.35)  # irradiance over pi of what faces the sun of --sun, slightly warm
+SUN = (1.6, 1.5, 1.35)  # irradiance on what faces the sun of --sun, slightly warm
 
 
 def light_of_options(options: Lighting, read: Callable[[str], Light] = read_light) -> Light:
@@ -119,7 +119,7 @@ def prepare_cloud(options: Render, note: Callable[[str], None]) -> PreparedObjec
         transparent_parts=options.transparent_parts,
         report=note,
     )
-    cameras = cameras_of(views, placed.rotation, placed.origin) if views else ()
+    cameras = cameras_of(views, placed.rotation, placed.origin, options.resolution or SIZE) if views else ()
     volume = model.encode(placed.cloud, options.densify)
     return PreparedObject(placed=placed, model=model, volume=volume, light=light, cameras=cameras)
 

@@ -90,6 +90,14 @@ def test_the_training_step_moves_every_weight(name):
         assert float(metrics["loss"]) == pytest.approx(error[hit].mean(), rel=1e-4)
 
 
+def test_an_object_without_points_has_a_finite_code():
+    encoder, points = points2nerf.Encoder(HYPER), jnp.zeros((2, 5, 6))
+    mask = jnp.array([[True] * 5, [False] * 5])
+    variables = encoder.init(jax.random.key(0), points, mask)
+    gradients = jax.grad(lambda of: sum(map(jnp.sum, encoder.apply(of, points, mask))))(variables)
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((encoder.apply(variables, points, mask), gradients)))
+
+
 @pytest.mark.parametrize(
     ("make", "hint"),
     [

@@ -45,6 +45,17 @@ def test_an_angle_of_view_gives_the_focal_length_and_distortion_is_said(tmp_path
     assert lines == ["lens distortion is left out: pinhole cameras are drawn"]
 
 
+def test_the_original_nerfs_file_has_square_cameras_of_any_size(tmp_path):
+    frames = describe_cameras(cameras(), ["a", "b"], np.eye(3), np.zeros(3))["frames"]
+    names = ("file_path", "transform_matrix")
+    document = {"camera_angle_x": 0.7, "frames": [{name: frame[name] for name in names} for frame in frames]}
+    one, _ = read_cameras(write(tmp_path, document), size=100)
+    assert (one.width, one.height) == (100, 100)
+    np.testing.assert_allclose(
+        one.intrinsics, [[50 / np.tan(0.35), 0, 50], [0, 50 / np.tan(0.35), 50], [0, 0, 1]], rtol=1e-6
+    )
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

@@ -71,7 +71,10 @@ def test_a_skin_lies_where_its_joints_put_it_whatever_its_own_node_says(tmp_path
 
 def test_instances_are_drawn_each_in_its_place_and_hidden_nodes_with_their_children_are_not(tmp_path):
     builder = GltfBuilder(extensionsRequired=["EXT_mesh_gpu_instancing"])
-    moves = {"TRANSLATION": np.float32([[1, 0, 0], [0, 5, 0]]), "ROTATION": np.array([[0, 0, 0, 127], [0, 127, 0, 0]], "i1")}
+    moves = {
+        "TRANSLATION": np.float32([[1, 0, 0], [0, 5, 0]]),
+        "ROTATION": np.array([[0, 0, 0, 127], [0, 127, 0, 0]], "i1"),
+    }
     attributes = {name: builder.accessor(values) for name, values in moves.items()}
     builder.document["accessors"][-1]["normalized"] = True
     instances = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}

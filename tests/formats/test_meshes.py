@@ -172,7 +172,9 @@ def test_an_opaque_material_has_its_colour_or_texture_and_its_roughness(tmp_path
     assert (look.wrap, asset.ignored) == (wrap, ignored)
 
 
-@pytest.mark.parametrize(("head", "shininess"), [("# Blender 4.1.1 MTL File: 'None'", 1000), ("# Blender MTL File: ''", 900)])
+@pytest.mark.parametrize(
+    ("head", "shininess"), [("# Blender 4.1.1 MTL File: 'None'", 1000), ("# Blender MTL File: ''", 900)]
+)
 def test_the_roughness_of_blenders_files_is_the_one_that_it_wrote_them_from(tmp_path, head, shininess):
     for roughness in (0.2, 0.5, 1):
         text = f"{head}\nnewmtl paint\nNs {shininess * (1 - roughness) ** 2:.6f}\n"

@@ -212,7 +212,11 @@ def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
             pack_arrays({"points": BALL, "y": np.arange(420) % 4, "rgb": np.zeros(3)}),
             "arrays that are not used, which name no column of the 420 points: y, rgb",
         ),
-        ("a.txt", table(" ", columns=MOVING), "the 6 columns, which have no names, taken as x y z intensity scalar scalar"),
+        (
+            "a.txt",
+            table(" ", columns=MOVING),
+            "the 6 columns, which have no names, taken as x y z intensity scalar scalar",
+        ),
     ],
 )
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):

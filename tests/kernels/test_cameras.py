@@ -1,5 +1,7 @@
 """Poses, pixel grids, projection and the ray/box interval."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,6 +118,11 @@ class TestOrbit:
         close(pose[[0, 2], 3] - centre[jnp.array([0, 2])], 3 * np.cos(elevation) * np.array([np.sin(2.5), np.cos(2.5)]))
         close(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=1e-5)
         assert pose[1, 3] - centre[1] == pytest.approx(3 * np.sin(elevation), abs=1e-5)
+
+    def test_poses_are_continuous_over_the_poles(self):
+        for azimuth, pole in itertools.product((0.0, 1.0, 4.0), (-np.pi / 2, np.pi / 2)):
+            poses = [np.asarray(orbit(azimuth, pole + step, 3.0, jnp.zeros(3))) for step in (-2e-3, 0, 2e-3)]
+            close(np.diff(poses, axis=0), np.zeros((2, 3, 4)), atol=1e-2)
 
 
 def test_views_become_one_axis_of_rays():

@@ -56,6 +56,8 @@ def test_measured_points_are_kept_as_they_are_and_learned_points_are_told(params
     assert (learned <= 1).all()
     assert COUNT < len(learned) - COUNT < 4 * COUNT
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
+    told = points.replace(learned=np.full(SIZE, 0.7, np.float32))
+    np.testing.assert_array_equal(run(params, told, spnr_jax.neighbors(points)).learned[:SIZE], told.learned)
     evenness = geometry.measure_evenness(points, spnr_jax.neighbors(points))
     close(dense.evenness, np.full(len(dense.mask), evenness), rtol=1e-4)
 

@@ -55,6 +55,12 @@ def test_light_a_plus_light_b_is_their_sum_and_a_multiple_a_multiple(model, volu
     np.testing.assert_allclose(twice[clear], 2 * a[clear], atol=2e-3)
 
 
+def test_lights_stay_in_single_precision_whatever_numbers_change_them():
+    light = read_light("studio")
+    for changed in (light.turned(10), light.turned(np.float64(3)), np.float64(2) * light, light / np.float64(3)):
+        assert changed.tables.dtype == np.float32
+
+
 @pytest.mark.parametrize(("shadowed", "most"), [(True, 0.01), (False, 5e-3)])
 def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(model, body, volume, shadowed, most):
     """Not exactly where there are shadows: the 64 directions that see the points stand still."""

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.laws import close, numbers
-from support.surfel_clouds import camera, cloud, shape
+from support.surfel_clouds import camera, cloud, shape, surfels
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Volume
+from spnr_jax.kernels.records import SurfelScene, Volume
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_method import encode_in_box
-from spnr_jax.method.surfel_renderer import GRID, choose_resolution
+from spnr_jax.method.surfel_renderer import GRID, Plan, choose_resolution
 from spnr_jax.nn.shader import NUM_FEATURES, Shader
 from spnr_jax.surfels.lighting import light_of
 
@@ -68,6 +68,28 @@ def test_more_padding_changes_no_surfel(scene):
     assert not wider.surfels.mask[400:].any()
 
 
+def test_more_padding_changes_no_surfel_of_a_rod_thinner_than_a_cell_of_the_depth_buffers():
+    rod = cloud(shape("rod", 1200)[0] * np.float32([0.02, 0.02, 1]))
+    narrow, wider = (encode_in_box(rod, count).surfels for count in (2048, 8192))
+    for name in ("normal", "one_sided", "visibility"):
+        np.testing.assert_allclose(getattr(wider, name)[:1200], getattr(narrow, name)[:1200], atol=1e-3)
+
+
+def test_an_eye_close_to_a_floor_sees_none_of_it_above_the_horizon():
+    across = np.stack(np.meshgrid(*2 * [np.arange(-3, 3, 0.3)]), axis=-1).reshape(-1, 2)
+    floor = surfels(np.insert(across, 1, -0.1, axis=1), (0.0, 1, 0), 0.3, one_sided=np.zeros(len(across)))
+    scene = SurfelScene(surfels=floor, spacing=jnp.float32(0.3), centre=jnp.zeros(3), scale=jnp.float32(1))
+    view = camera(64, eye=(0, 0, 0), target=(0.0, 0, -1), field_of_view=np.pi / 2)
+    found = surfel_renderer.render(None, scene, view, LIGHT, plan=Plan(0, 1, 64, 64, 2**18, 4096))
+    assert not found.acc[:30].any()
+    assert found.acc[34:].min() > 0.9
+
+
+def test_from_inside_points_are_drawn_at_the_resolution_at_which_they_are_seen(scene):
+    inside, outside = (camera(128, eye=(0, 0, z), target=(0.0, 0, -5), field_of_view=1.57) for z in (0.0, 0.6))
+    assert choose_resolution(scene, inside) == choose_resolution(scene, outside)
+
+
 def truth(view):
     """Distance along each ray to the ball, 0 beside it, and how near the ray passes its middle."""
     rays = jax.tree.map(np.float64, cameras.camera_rays(view))
@@ -86,6 +108,10 @@ def check_ball(found, view, spacing):
     assert np.all(np.asarray(found.acc)[outside] == 0)
     assert np.all(np.asarray(found.image)[outside] == 1)
     assert np.abs(np.asarray(found.depth) - distance)[inside].max() < spacing + 0.02 * distance.max()
+    rays = cameras.camera_rays(view)
+    seen, far = np.asarray(found.acc) > 0.05, np.asarray(cameras.intersect_box(rays.origins, rays.directions)[1])
+    own = ((found.depth - (1 - found.acc) * far) / found.acc)[seen]  # also along the outline
+    assert own.min() > np.linalg.norm(view.cam_to_world[:, 3]) - RADIUS - spacing
 
 
 def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):

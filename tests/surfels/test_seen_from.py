@@ -17,13 +17,13 @@ def seen(positions, normals, spacing, mask=None):
     count = len(positions)
     arrays = (jnp.asarray(np.asarray(x, np.float32).T) for x in (positions, np.broadcast_to(normals, (count, 3))))
     mask = jnp.asarray(np.ones(count, bool) if mask is None else mask)
-    cell = choose_cell(jnp.float32(spacing), GRID)
+    cell = jnp.maximum(sides.CELL * jnp.float32(spacing), sides.BOX / GRID)
     return np.asarray(_seen_from(*arrays, jnp.full(count, spacing, jnp.float32), mask, cell, grid=GRID)).T
 
 
 def loop(positions, normals, spacing):
     """The same in float64, cell by cell."""
-    cell, grid = float(choose_cell(jnp.float32(spacing), GRID)), GRID
+    cell, grid = max(sides.CELL * spacing, sides.BOX / GRID), GRID
     out = np.zeros((len(positions), len(DIRECTIONS)))
     for d, axes in enumerate(zip(DIRECTIONS, *tangents(DIRECTIONS), strict=True)):
         towards, right, up = np.float64(axes)
@@ -96,7 +96,7 @@ def test_the_grid_covers_the_box_with_few_sizes_and_never_more_than_1024_cells()
         assert sides.COARSEST <= grid <= sides.FINEST
         assert grid % 16 == 0
         for spacing in np.geomspace(1e-7, 3.0, 20):
-            cell = float(choose_cell(jnp.float32(spacing), grid))
+            cell = float(choose_cell(jnp.float32(spacing), jnp.asarray(int(count))))
             assert cell * grid >= sides.BOX * (1 - 1e-6)
             assert cell >= sides.CELL * spacing * (1 - 1e-6)
     assert choose_grid(16384) == 512
