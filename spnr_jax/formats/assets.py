@@ -164,7 +164,8 @@ class Loading:
         try:
             return read_image(data, name)
         except UserError as error:
-            self.go_on_without(*str(error).split(": ", 1))
+            reason, _, found = str(error).partition(": ")
+            self.go_on_without(reason, found)
         return None
 
     def say(self, *sentences: str, about: str = "") -> None:

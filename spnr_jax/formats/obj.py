@@ -168,16 +168,16 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     current: dict[str, str] = {}
     text = data.decode("utf-8-sig", "replace")
     blender = SHININESS.match(text)
+    shiniest = blender and (900 if blender[1] else 1000)
     for line in text.splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword.lower() == "newmtl":
             current = library.setdefault(rest.strip(), {})
         elif keyword and not keyword.startswith("#"):
             current[keyword.lower()] = re.sub(r"\s#.*", "", rest).strip()
-    for entry in library.values() if blender else ():
-        if "ns" in entry:
-            full = 900 if blender[1] else 1000
-            entry.setdefault("pr", str(1 - min(max(float(entry["ns"]) / full, 0), 1) ** 0.5))
+    for entry in library.values():
+        if shiniest and "ns" in entry:
+            entry.setdefault("pr", str(1 - min(max(float(entry["ns"]) / shiniest, 0), 1) ** 0.5))
     return library
 
 

@@ -161,7 +161,8 @@ def _colored(
         loading.ignored.add("roughness and metallic of vertices")
     alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
     if colors is None and (found := colors_of(rename(of_faces))) is not None:
-        positions, normals, alpha = (None if x is None else x[faces.ravel()] for x in (positions, normals, alpha))
+        normals, alpha = (None if x is None else x[faces.ravel()] for x in (normals, alpha))
+        positions = positions[faces.ravel()]
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
     material = make_material(0.5 if colors is None else 1.0)

@@ -245,8 +245,8 @@ SCATTER = np.uint64(0x9E3779B97F4A7C15)  # odd, 2^64 over the golden ratio: mult
 def sample_stream(pieces: Iterable[Columns], most: int) -> tuple[Columns, int]:
     """Columns of at most `most` rows of all pieces, each with the same chance, and the total number of rows.
 
-    All rows if there are no more than that, otherwise about half of `most` or more.  Whether a row is kept depends only on
-    its number.  At any time, only the kept rows and one piece are in memory.
+    All rows if there are no more than that, otherwise about half of `most` or more.  Whether a row is kept depends only
+    on its number.  At any time, only the kept rows and one piece are in memory.
     """
     kept: Columns = {}
     keys, num_rows, halvings = np.zeros(0, np.uint64), 0, 0
