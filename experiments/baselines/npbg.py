@@ -30,7 +30,7 @@ from spnr_jax.config import (
 )
 from spnr_jax.errors import require
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.imaging import resize_bilinear
+from spnr_jax.kernels.imaging import average_pool, resize_bilinear
 from spnr_jax.kernels.numerics import per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rendering
 from spnr_jax.nn.convolution import conv
@@ -165,7 +165,7 @@ def half(x: Float[Array, "batch height width c"]) -> Float[Array, "batch h w c"]
     height, width = (side // 2 for side in x.shape[1:3])
     if x.shape[1:3] != (2 * height, 2 * width):
         x = resize_bilinear(x, 2 * height, 2 * width)
-    return jnp.mean(x.reshape(x.shape[0], height, 2, width, 2, x.shape[-1]), axis=(2, 4))
+    return average_pool(x, 2)
 
 
 class RefinementNet(nn.Module):

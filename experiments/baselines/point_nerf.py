@@ -40,6 +40,7 @@ from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.numerics import length, per_feature
 from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
 from spnr_jax.kernels.voxels import map_existing
+from spnr_jax.nn.paper_layers import encode_direction, waves
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
 SLOPE, GAIN = 0.01, math.sqrt(2 / (1 + 0.01**2))  # of the leaky ReLU, and what it asks of the weights before it
@@ -216,12 +217,7 @@ def nearest_points(
 def point_features(cloud: PointCloud, frequencies: int) -> Float[Array, "points channels"]:
     """The materials of each point and their waves."""
     materials = jnp.concatenate([cloud.base_color, cloud.roughness[:, None], cloud.metallic[:, None]], axis=-1)
-    return jnp.concatenate([materials, waves(materials, frequencies)], axis=-1)
-
-
-def waves(x: Float[Array, "*batch channels"], frequencies: int) -> Float[Array, "*batch encoding"]:
-    """[sin(x), cos(x), sin(2 x), cos(2 x), ...], 2 * frequencies numbers for each channel."""
-    return jnp.concatenate([f(x * 2**k) for k in range(frequencies) for f in (jnp.sin, jnp.cos)], axis=-1)
+    return encode_direction(materials, frequencies)
 
 
 def mlp(layers: Sequence[Layer], x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
@@ -250,7 +246,7 @@ def shade(
     index, valid = nearest_points(places, cloud, config.num_neighbors, config.radius)
     offset = places[:, None] - cloud.positions[index]
     seen = jnp.einsum("pkj,pji->pki", offset, axes, precision="highest")
-    encoded = waves(jnp.concatenate([offset, seen], axis=-1), config.offset_frequencies)
+    encoded = jnp.concatenate(waves(jnp.concatenate([offset, seen], axis=-1), config.offset_frequencies), axis=-1)
     feature = mlp(weights["near"], jnp.concatenate([features[index], encoded], axis=-1))
     feature = mlp(weights["colored"], jnp.concatenate([feature, cloud.base_color[index]], axis=-1))
     density = config.density_scale * nn.softplus(dense(weights["density"][0], feature)[..., 0] - 1)
@@ -258,7 +254,7 @@ def shade(
     share = jnp.where(valid, 1 / away, 0.0)
     share = share / jnp.maximum(jnp.sum(share, axis=-1, keepdims=True), 1e-8)
     feature = jnp.einsum("pk,pkc->pc", share, feature)
-    view = waves(directions, config.direction_frequencies)
+    view = jnp.concatenate(waves(directions, config.direction_frequencies), axis=-1)
     hidden = mlp(weights["color"][:-1], jnp.concatenate([feature, view], axis=-1))
     rgb = nn.sigmoid(dense(weights["color"][-1], hidden)) * (1 + 2 * WIDENED) - WIDENED
     return jnp.sum(share * density, axis=-1), rgb

@@ -212,7 +212,8 @@ def check_light(light: Light | None) -> None:
 class GBuffer:
     """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes.
 
-    `opacity` is that of all surfels along the ray, `coverage` the summed weights of the front-most.  `depth` is along
+    `opacity` is the sum of the blend weights of the listed entries, at most 1; `coverage` that of their squared
+    kernels, faded for back faces, times the transmittance in front of them: it grows with overlap.  `depth` is along
     the camera's axis, `depth_deviation` its standard deviation.  `color` is blended with narrower weights than the
     rest; `sharp_weight` is their sum, and `centre_offset` the mean offset of the discs' centres from the pixel's, in
     pixels.  All fields are 0 at pixels without discs.

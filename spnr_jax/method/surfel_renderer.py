@@ -138,7 +138,10 @@ def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int
     window = crop_camera(whole, corner, width, height)
     foot = splatting.project_discs(scene.surfels, window)
     return Sizes(
-        width, height, splatting.count_entries(foot.covered), splatting.count_covered(foot, _largest_window(whole))
+        width,
+        height,
+        splatting.count_entries(foot.covered),
+        splatting.bound_covered_pixels(foot, _largest_window(whole)),
     )
 
 

@@ -33,12 +33,16 @@ from spnr_jax.nn.convolution import BatchNorm, GroupNorm, conv, kernel_init, ups
 # --- encoding ---------------------------------------------------------------------------------------------------------
 
 
-def encode_direction(directions: Float[Array, "*batch 3"], num_frequencies: int) -> Float[Array, "*batch encoding"]:
+def encode_direction(
+    directions: Float[Array, "*batch channels"], num_frequencies: int
+) -> Float[Array, "*batch encoding"]:
     """[d, sin(d), cos(d), sin(2 d), cos(2 d), ...] of unit directions, 3 + 6 num_frequencies numbers."""
-    parts = [directions]
-    for k in range(num_frequencies):
-        parts += [jnp.sin(directions * 2**k), jnp.cos(directions * 2**k)]
-    return jnp.concatenate(parts, axis=-1)
+    return jnp.concatenate([directions, *waves(directions, num_frequencies)], axis=-1)
+
+
+def waves(x: Float[Array, "*batch channels"], num_frequencies: int) -> list[Float[Array, "*batch channels"]]:
+    """[sin(x), cos(x), sin(2 x), cos(2 x), ...]."""
+    return [of(x * 2**k) for k in range(num_frequencies) for of in (jnp.sin, jnp.cos)]
 
 
 # --- PointNet and scatter ---------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 Its inputs are relative: vectors in the camera's axes, lengths in spacings or pixels.  So a picture does not depend on a
 common rotation of object, camera and light, nor on the unit of the cloud.
 
-A U-Net runs on the attributes of the front-most surfels, at the resolution at which points lie two to four pixels
+A U-Net runs on the attributes of the front-most surfels, at the resolution at which points lie 0.8 to 3.5 pixels
 apart, so its input looks alike for any number of points.  One block then doubles the resolution, as often as the
 picture needs.  Its outputs are factors of light maps (`compose_picture`).  The light is not an input, so a picture is
 linear in it up to the sRGB curve.

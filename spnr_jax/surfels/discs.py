@@ -126,16 +126,17 @@ def find_clip_lines(
     """At a sharp edge, the plane of the other face cuts a disc (clip lines, Zwicker et al. 2004)."""
     across, up, facing = (project_on(normals, axis) for axis in axes)
     flat = safe_sqrt(across**2 + up**2)
-    clip_lines = (facing < CONSTANTS.edge_cosine) & (flat > CONSTANTS.edge_sine) & (hood.real > 0)
-    clip_lines = (
-        clip_lines
+    cuts = (
+        (facing < CONSTANTS.edge_cosine)
+        & (flat > CONSTANTS.edge_sine)
+        & (hood.real > 0)
         & (neighbors_one_sided > 0.5)
         & (one_sided > 0.5)[None]
         & (hood.squared < (CONSTANTS.rim_radius * spacing[None]) ** 2)
     )
-    inverse = jnp.where(clip_lines, 1 / jnp.where(clip_lines, flat, 1), 0)
+    inverse = jnp.where(cuts, 1 / jnp.where(cuts, flat, 1), 0)
     line = jnp.sum(normals * hood.offset, axis=1) / spacing[None] * inverse
-    distance = jnp.where(clip_lines & (line > 0), line + CONSTANTS.cut_margin, jnp.inf)
+    distance = jnp.where(cuts & (line > 0), line + CONSTANTS.cut_margin, jnp.inf)
     return ClipLines(*jax.lax.optimization_barrier((distance, across * inverse, up * inverse)))
 
 
@@ -162,8 +163,8 @@ def find_rims(
 
     def find_end(direction: tuple[Array, Array]) -> Array:
         right, high = direction
-        cut_cosine = clip_lines.across * right[None] + clip_lines.up * high[None] > CONSTANTS.cut_cosine
-        line = smallest(jnp.where(cut_cosine, clip_lines.distance, jnp.inf))
+        faces = clip_lines.across * right[None] + clip_lines.up * high[None] > CONSTANTS.cut_cosine
+        line = smallest(jnp.where(faces, clip_lines.distance, jnp.inf))
         angle = jnp.arctan2(*jax.lax.stop_gradient((high, right)))
         step = jnp.round(angle / (2 * jnp.pi) * NUM_RIM_DIRECTIONS).astype(jnp.int32) % NUM_RIM_DIRECTIONS
         end = jnp.take_along_axis(ends, step[None], axis=0)[0]

@@ -154,9 +154,8 @@ def outward_normals(
     rest = np.setdiff1d(np.arange(len(positions)), kept)
     others = max(0, VOTERS - len(kept))
     voters = np.concatenate([kept, np.random.default_rng(0).permutation(rest)[:others]])
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    half = np.linalg.norm(high - low) / 2 or 1.0
-    in_box = np.asarray((positions[voters] - (low + high) / 2) / half, np.float32)
+    centre, scale = cloud_arrays.normalization(positions)
+    in_box = np.asarray((positions[voters] - centre) * scale, np.float32)
     order, near = order_in_space(in_box)
     size = cloud_arrays.bucket(len(order))
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.kernels.numerics import array_namespace, clamp, dot, sum_first
+from spnr_jax.kernels.numerics import array_namespace, clamp, dot, sum_first, tangent_frame
 from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on, weigh_distance, weigh_height
+from spnr_jax.surfels.splatting import RADIUS
 
 # --- visibility -------------------------------------------------------------------------------------------------------
 
@@ -25,7 +26,6 @@ from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on, 
 NUM_DIRECTIONS = 64
 CELL = 1.5  # width of a cell, in spacings
 STEEPEST = 8.0  # largest slope of a plane relative to the direction
-DISC_RADIUS = 1.6  # radius of a disc, in spacings: in cells beyond it, a point counts at its own depth
 SOFTNESS = 1.0  # spacings behind the depth buffer over which visibility falls to 0
 COARSEST, FINEST = 256, 1024  # least and largest number of cells along a side
 BOX = 2.2  # side of the square that each buffer covers: the box's diagonal is 2
@@ -37,17 +37,6 @@ def spiral(count: int) -> Float[np.ndarray, "count 3"]:
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
     return np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], axis=1).astype(np.float32)
-
-
-def tangents(normals: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Two unit vectors orthogonal to each unit normal and to each other (Duff et al. 2017)."""
-    x, y, z = normals.T
-    sign = np.where(z >= 0, 1.0, -1.0)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = np.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
-    second = np.stack([b, sign + y**2 * a, -y], axis=-1)
-    return first.astype(np.float32), second.astype(np.float32)
 
 
 DIRECTIONS = spiral(NUM_DIRECTIONS)
@@ -96,7 +85,7 @@ def compute_visibility(
         across, high = (dot(axis, positions) / cell + grid / 2 for axis in (right, up))
         column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
         depth = dot(towards, positions)
-        most = DISC_RADIUS * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
+        most = RADIUS * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
         nearest = jnp.full(grid * grid, -2 * BOX, depth.dtype)
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
             nearer = beside(column + i, row + j, across, high, steep)
@@ -110,8 +99,8 @@ def compute_visibility(
         behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
         return jnp.clip(1 - behind / SOFTNESS, 0, 1)
 
-    axes = (jnp.asarray(axis, positions.dtype) for axis in (DIRECTIONS, *tangents(DIRECTIONS)))
-    return jax.lax.map(look, tuple(axes))
+    right, up, towards = jnp.moveaxis(tangent_frame(jnp.asarray(DIRECTIONS.T, positions.dtype)), 2, 1)
+    return jax.lax.map(look, (towards, right, up))
 
 
 # --- votes ------------------------------------------------------------------------------------------------------------

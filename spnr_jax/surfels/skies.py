@@ -146,7 +146,7 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
 def sun(azimuth: Angle, elevation: Angle, size: Angle = 3.0, color: Color = (1, 1, 1)) -> Light:
     """A distant round lamp of `size` degrees; angles as in `Model.camera`; `color` is the irradiance facing it.
 
-    All arguments may be traced.  Visibility has 64 directions, so shadows are never sharper than about ten degrees.
+    All arguments may be traced.  Visibility has 64 directions, so shadows are never sharper than about 24 degrees.
     """
     return light_of(lamp(azimuth, elevation, size, color))
 

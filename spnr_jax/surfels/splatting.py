@@ -150,7 +150,7 @@ def count_entries(covered: Int[Array, " points"]) -> Int[Array, ""]:
     return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST_COUNTED).astype(jnp.int32)
 
 
-def count_covered(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
+def bound_covered_pixels(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
     """Number of pixels in the union of the discs' rectangles; `most` bounds the rows and columns of the picture."""
     rows, columns = (n + 1 for n in most)
     across = (foot.left, 1), (foot.left + foot.width, -1)

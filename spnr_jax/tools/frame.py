@@ -29,7 +29,7 @@ from spnr_jax.tools.pictures import light_of_options, put_background
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
 OBJECT_RADIUS = 1.2  # of a ball in the box that contains the drawn object; its points lie within 1
-FARTHEST = 1e3  # boxes; beyond, float32 rays miss (README, "Numerical domain")
+FARTHEST = 1e3  # boxes; beyond, float32 rays miss (docs/lab/stability.md)
 MOST_PIXELS = 2**16  # along a side of a browser's canvas
 NARROWEST, WIDEST = 1e-3, np.deg2rad(150)
 OPENCV = np.diag([1.0, -1.0, -1.0])  # the browser's cameras look along +z with y down, ours along -z with y up

@@ -9,7 +9,7 @@ from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
 from spnr_jax.surfels.geometry import estimate_surfels, neighbors
 from spnr_jax.surfels.layers import CONSTANTS
-from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral, tangents
+from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral
 
 PADDED = (4096, 32768)  # sizes that clouds are padded to: each is compiled once, and blocks of padding cost nothing
 
@@ -47,6 +47,17 @@ def cloud(positions, **columns) -> PointCloud:
     columns = {"base_color": np.full((count, 3), 0.5), "roughness": np.full(count, 0.5)} | columns
     columns = {name: np.asarray(x, np.float32) for name, x in ({"metallic": np.zeros(count)} | columns).items()}
     return PointCloud(positions=np.asarray(positions, np.float32), mask=np.ones(count, bool), **columns)
+
+
+def tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors orthogonal to each unit normal and to each other (Duff et al. 2017)."""
+    x, y, z = normals.T
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
+    second = np.stack([b, sign + y**2 * a, -y], axis=-1)
+    return first.astype(np.float32), second.astype(np.float32)
 
 
 _estimate = jax.jit(estimate_surfels)

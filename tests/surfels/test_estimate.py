@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial import cKDTree
 from support.laws import close
 from support.surfel_clouds import estimate as surfels_of
-from support.surfel_clouds import even_square, shape
+from support.surfel_clouds import even_square, shape, tangents
 
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.surfels.layers import CONSTANTS
-from spnr_jax.surfels.sides import tangents
 from spnr_jax.surfels.splatting import RADIUS
 
 FIELDS = ("normal", "spacing", "color_jump", "one_sided", "visibility", "shape_ratios")

@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from support.surfel_clouds import shape
+from support.surfel_clouds import shape, tangents
 
 from spnr_jax.surfels import sides
-from spnr_jax.surfels.sides import DIRECTIONS, choose_cell, choose_grid, compute_visibility, tangents
+from spnr_jax.surfels.sides import DIRECTIONS, choose_cell, choose_grid, compute_visibility
 
 GRID = 64
 _seen_from = jax.jit(compute_visibility, static_argnames="grid")
@@ -38,7 +38,7 @@ def loop(positions, normals, spacing):
         buffer = {}
         for p, n in zip(positions, normals, strict=True):
             column, row = (int(np.floor(p @ axis / cell + grid / 2 - 0.5)) for axis in (right, up))
-            most = sides.DISC_RADIUS * spacing * np.sqrt(1 - (n @ towards) ** 2)
+            most = sides.RADIUS * spacing * np.sqrt(1 - (n @ towards) ** 2)
             for place in ((row + i, column + j) for i in (0, 1) for j in (0, 1)):
                 nearer = in_the_middle(p, n, *place[::-1])
                 depth = p @ towards + (nearer if nearer < most else 0)

@@ -24,7 +24,7 @@ from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.nn import shader
 from spnr_jax.scoring import evaluation
 from spnr_jax.surfels import lighting
-from spnr_jax.surfels.sides import DIRECTIONS, spiral, tangents
+from spnr_jax.surfels.sides import DIRECTIONS, spiral
 from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, trainer, weights
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
@@ -204,7 +204,7 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
     rng, mirror = np.random.default_rng(5), np.where(np.arange(3) == axis, -1, 1).astype(np.float32)
     normal = rng.normal(size=(60, 3)).astype(np.float32)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    rim, reach = tangents(normal)[0], rng.uniform(0.3, 2, (60, 4)).astype(np.float32)
+    rim, reach = surfel_clouds.tangents(normal)[0], rng.uniform(0.3, 2, (60, 4)).astype(np.float32)
     color = rng.random((60, 3), np.float32)
     pose = jnp.concatenate([jnp.eye(3), jnp.array([[0.0], [0.0], [3.0]])], axis=1)
     camera, seen = pinhole(pose, 0.7, 24, 24), []
