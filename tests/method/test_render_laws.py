@@ -163,6 +163,7 @@ def test_remat_and_map_have_the_same_values_and_gradients(params, scenes, views,
     close(by_brightness, sum(np.vdot(by[3].tables, light.tables) for _, by in each), rtol=1e-3)
 
 
+@pytest.mark.ci
 def test_forward_mode_is_reverse_mode(params, scenes, views, lights, value_and_gradient):
     given = params, scenes[0], views[0], lights[0]
     way = numbers(5, *scenes[0].surfels.position.shape)

@@ -74,7 +74,7 @@ def run(points, near):
     return jax.tree.map(np.asarray, (scene, gradients))
 
 
-@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("given", [pytest.param(False, marks=pytest.mark.ci), True])
 def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_near(given):
     points = with_normals(ball()) if given else without_normals(ball())
     near = spnr_jax.neighbors(points)
