@@ -23,6 +23,7 @@ from spnr_jax.kernels.triangles import triangulate
 
 Rests = dict[str, list]
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
+UNMOVED = np.array([[1.0, 1.0], [0.0, 0.0]])  # scale and offset of texture coordinates
 NEARLY_GREY = 16  # of 255: between the channels of a grey JPEG
 READ = {"kd", "pr", "pm", "ns", "d", "tr", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
@@ -52,15 +53,16 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+", names.strip())):
         library |= parse_mtl(loading.read(name) or b"")
     looks: dict[str, Material | None] = {}
+    moves: dict[str, np.ndarray] = {}
     for name in dict.fromkeys(text["usemtl"]):
-        looks[name] = make_material() if not name else _look(name, library.get(name), loading)
+        looks[name] = make_material() if not name else _look(name, library.get(name), loading, moves)
         look = looks[name]
         if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
             looks[name] = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
         elif colors is not None and look is not None:
             loading.say("colours of the vertices multiply those of the material", about=repr(name))
-    parts = _parts(text, stack_columns(columns), colors, looks, loading)
+    parts = _parts(text, stack_columns(columns), colors, looks, moves, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
     if text["vn"] and any(part.normals is None for part in parts):
@@ -114,7 +116,12 @@ def _columns(text: Rests, loading: Loading) -> Columns:
 
 
 def _parts(
-    text: Rests, positions: np.ndarray, colors: np.ndarray | None, looks: dict[str, Material | None], loading: Loading
+    text: Rests,
+    positions: np.ndarray,
+    colors: np.ndarray | None,
+    looks: dict[str, Material | None],
+    moves: dict[str, np.ndarray],
+    loading: Loading,
 ) -> list[Part]:
     """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
     numbers = {word: i for i, word in enumerate(dict.fromkeys(text["f"]))}
@@ -126,7 +133,7 @@ def _parts(
             raise UserError(f"has faces that name {keyword} {last} of {count}: broken file")
     of_v, of_vt, of_vn = corners.T - 1
     positions, colors = positions[of_v], None if colors is None else colors[of_v]
-    texcoords = _table([*text["vt"], "0 0"], 2)[of_vt] * [1, -1] + [0, 1]  # v is from the lower edge
+    texcoords = _table([*text["vt"], "0 0"], 2)[of_vt]
     normals = _table([*text["vn"], "0 0 0"], 3)[of_vn]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
     number = {name: i for i, name in enumerate(looks)}
@@ -140,10 +147,12 @@ def _parts(
         loading.ignored.add(f"{int((~first).sum())} doubled faces (one of each is kept)")
     parts, faces, kind = [], faces[order[first]], kind[order[first]]
     for code in np.unique(kind):
-        material = list(looks.values())[code // 4]
+        name, material = list(looks.items())[code // 4]
         assert material is not None
         part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
-        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=texcoords if code & 2 else None))
+        scale, offset = moves.get(name, UNMOVED)
+        moved = (texcoords * scale + offset) * [1, -1] + [0, 1]  # v is from the lower edge
+        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=moved if code & 2 else None))
     return parts
 
 
@@ -181,8 +190,11 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     return library
 
 
-def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Material | None:
-    """The principled material of an MTL entry; None where it is nowhere to be seen."""
+def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict[str, np.ndarray]) -> Material | None:
+    """The principled material of an MTL entry; None where it is nowhere to be seen.
+
+    `moves` gets the scale and offset of its texture coordinates, those of its first map (2, 2).
+    """
     ignored = loading.ignored
     if entry is None:
         loading.go_on_without("uses a material that no library defines", repr(name))
@@ -196,9 +208,14 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Material
         while option := OPTION.match(statement):
             options[option[1]] = option[2].split()
             statement = statement[option.end() :]
-        ignored |= {f"MTL map option -{option}" for option in options if option != "clamp"}
+        ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
         file = statement.strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
+            own = np.array(
+                [[float(x) for x in (*options.get(of, ()), *2 * plain)[:2]] for of, plain in (("s", "1"), ("o", "0"))]
+            )
+            if (moves.setdefault(name, own) != own).any():
+                ignored.add("second texture with its own coordinates")
             maps[key] = texels
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}

@@ -140,7 +140,8 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
-        loading.ignored.add("colours of some faces alone")
+        palette = all(len(values) == 1 for values in behind)
+        loading.ignored.add("colours of faces by a palette" if palette else "colours of some faces alone")
     return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 

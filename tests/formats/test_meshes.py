@@ -152,10 +152,19 @@ def test_normals_are_kept_and_v_is_counted_from_above(tmp_path):
     np.testing.assert_allclose(part.texcoords, np.stack([part.positions[:, 0], 1 - part.positions[:, 1]], axis=-1))
 
 
+@pytest.mark.parametrize(
+    ("options", "scale", "offset"), [("-s 2 0.5 1", (2, 0.5), (0, 0)), ("-o .25 -s 3", (3, 1), (0.25, 0))]
+)
+def test_texture_coordinates_are_scaled_and_moved_as_the_map_says(tmp_path, options, scale, offset):
+    (part,) = load_mesh(write_obj(tmp_path, TEXTURED, f"newmtl paint\nmap_Kd {options} pine.png\n")).parts
+    upright = part.positions[:, :2] * scale + offset
+    np.testing.assert_allclose(part.texcoords, np.stack([upright[:, 0], 1 - upright[:, 1]], axis=-1))
+
+
 LINEAR = srgb_to_linear(CHECKER / 255)
 PLACEHOLDER = "Kd 0.8 0.8 0.8\nmap_Kd -s 2 -.5 1e-1 -clamp on 3d wood.png"
 LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ignored
-    (PLACEHOLDER, (LINEAR, 0.5, 0, "clamp"), ("MTL Kd beside map_Kd", "MTL map option -s")),
+    (PLACEHOLDER, (LINEAR, 0.5, 0, "clamp"), ("MTL Kd beside map_Kd",)),
     ("Kd 0.1 0.2 0.3\nNs 98\nKs 0 0 0", (np.float32([0.1, 0.2, 0.3]), 0.5, 0, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10", (np.float32([0.1, 0.2, 0.3]), 0.25, 0.75, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nNs 98\nd 1\nTr 0", (np.float32([0.1, 0.2, 0.3]), np.sqrt(2 / 100), 0, "repeat"), ()),
