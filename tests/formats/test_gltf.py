@@ -7,7 +7,18 @@ import sys
 
 import numpy as np
 import pytest
-from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, one_square, png, textured_square
+from support.gltf_files import (
+    CHECKER,
+    CORNERS,
+    SQUARE,
+    UV,
+    GltfBuilder,
+    instanced,
+    one_square,
+    png,
+    skinned,
+    textured_square,
+)
 from support.mesh_files import glass, painted, refusal, square
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
 from support.point_tables import WHOLE, as_scan
@@ -70,15 +81,7 @@ def test_a_skin_lies_where_its_joints_put_it_whatever_its_own_node_says(tmp_path
 
 
 def test_instances_are_drawn_each_in_its_place_and_hidden_nodes_with_their_children_are_not(tmp_path):
-    builder = GltfBuilder(extensionsRequired=["EXT_mesh_gpu_instancing"])
-    moves = {
-        "TRANSLATION": np.float32([[1, 0, 0], [0, 5, 0]]),
-        "ROTATION": np.array([[0, 0, 0, 127], [0, 127, 0, 0]], "i1"),
-    }
-    attributes = {name: builder.accessor(values) for name, values in moves.items()}
-    builder.document["accessors"][-1]["normalized"] = True
-    instances = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
-    builder.mesh(builder.primitive(), scale=[2, 2, 2], **instances)
+    builder = instanced(scale=[2, 2, 2])
     child = builder.mesh(builder.primitive(CORNERS * 9), root=False)
     builder.node(children=[child], extensions={"KHR_node_visibility": {"visible": False}})
     (part,) = load_mesh(builder.write(tmp_path / "a.glb")).parts
@@ -122,24 +125,6 @@ def test_quantised_and_strided_positions_are_decoded(tmp_path):
 
 
 # What is refused
-
-
-def skinned(joints=((0, 0, 0, 0),) * 4, armature=None, inverse=None, **node) -> GltfBuilder:
-    """A scene of a square that hangs on one joint of a moved armature, half of its weights written."""
-    builder = GltfBuilder()
-    weights = np.tile(np.float32([0.5, 0, 0, 0]), (4, 1))
-    primitive = builder.primitive(JOINTS_0=np.array(joints, np.uint8), WEIGHTS_0=weights, NORMAL=CORNERS * 0 + FACING)
-    builder.mesh(primitive, skin=0, **node)
-    joint = builder.node(root=False, name="hip")
-    builder.node(children=[joint], **(armature or {}))
-    skin = {"joints": [joint]}
-    if inverse is not None:
-        skin["inverseBindMatrices"] = builder.accessor(np.float32(inverse).T.reshape(1, 16))
-    builder.document["skins"] = [skin]
-    return builder
-
-
-FACING = np.float32([0, 0, 1])
 
 
 def repeat(document):

@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 from support import splat_balls, tiny_dataset
-from support.gltf_files import UV, GltfBuilder, png
+from support.gltf_files import UV, GltfBuilder, instanced, png, skinned
 from support.packed_meshes import draco_square, meshopt_files
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
@@ -181,9 +181,8 @@ def objs() -> list[Files]:
     """A box with two materials, one of them textured and cut out."""
     corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + "vt 0 0\nvt 1 0\nvt 1 1\n"
     faces = "mtllib a.mtl\nvn 0 0 1\nusemtl red\nf 1/1/1 2/2/1 4/3/1\nusemtl plain\nf -1 -2 -4 -3\nf 1 2 6 5 3\n"
-    library = (
-        b"newmtl red\nKd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nmap_d b.png\nnewmtl plain\nKd 0.1 0.2 0.3\nTr 0.4\n"
-    )
+    library = b"# Blender 4.1 MTL File\nnewmtl red\nNs 9\n"
+        b"Kd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nmap_d b.png\nnewmtl plain\nKd 0.1 0.2 0.3\nTr 0.4\n"
     companions = {"a.mtl": library, "a.png": png(TEXELS[..., :3]), "b.png": png(TEXELS)}
     return [{"mesh.obj": (corners + faces).encode()} | companions, *tables(".obj")]
 
@@ -205,7 +204,7 @@ def scene(material: dict, *images: tuple[str, bytes], suffix: str = ".gltf") -> 
 
 
 def scenes() -> list[Files]:
-    """Masks, glass, normal maps, textures that lie differently, the older specular workflow, WebP, points."""
+    """Masks, glass, normal maps, moved textures, the older specular workflow, WebP, points, a skin, instances."""
     webp = io.BytesIO()
     Image.fromarray(TEXELS.astype(np.uint8)).save(webp, "webp", lossless=True)
     pictures = ("a.png", png(TEXELS)), ("b.png", png(TEXELS[..., :3]))
@@ -221,6 +220,8 @@ def scenes() -> list[Files]:
         scene({"extensions": shiny, "emissiveFactor": [0, 0.1, 0], "alphaMode": "BLEND"}, *pictures),
         scene(base, ("a.webp", webp.getvalue())),
         scene({}, suffix=".glb"),
+        skinned(inverse=np.eye(4)).files("mesh.gltf"),
+        instanced().files("mesh.gltf"),
         *tables(".gltf", ".glb"),
     ]
 

@@ -118,3 +118,34 @@ def textured_square(tmp_path, info=None, factors=None, sampler=None, **attribute
         material=builder.material(pbrMetallicRoughness=pbr),
         **({"TEXCOORD_0": UV} | attributes),
     )
+
+
+def skinned(joints=((0, 0, 0, 0),) * 4, armature=None, inverse=None, **node) -> GltfBuilder:
+    """A scene of a square that hangs on one joint of a moved armature, half of its weights written."""
+    builder = GltfBuilder()
+    weights = np.tile(np.float32([0.5, 0, 0, 0]), (4, 1))
+    primitive = builder.primitive(
+        JOINTS_0=np.array(joints, np.uint8), WEIGHTS_0=weights, NORMAL=np.tile(np.float32([0, 0, 1]), (4, 1))
+    )
+    builder.mesh(primitive, skin=0, **node)
+    joint = builder.node(root=False, name="hip")
+    builder.node(children=[joint], **(armature or {}))
+    skin = {"joints": [joint]}
+    if inverse is not None:
+        skin["inverseBindMatrices"] = builder.accessor(np.float32(inverse).T.reshape(1, 16))
+    builder.document["skins"] = [skin]
+    return builder
+
+
+def instanced(**node) -> GltfBuilder:
+    """A scene of a square that is drawn twice: moved, and moved and turned."""
+    builder = GltfBuilder(extensionsRequired=["EXT_mesh_gpu_instancing"])
+    moves = {
+        "TRANSLATION": np.float32([[1, 0, 0], [0, 5, 0]]),
+        "ROTATION": np.array([[0, 0, 0, 127], [0, 127, 0, 0]], "i1"),
+    }
+    attributes = {name: builder.accessor(values) for name, values in moves.items()}
+    builder.document["accessors"][-1]["normalized"] = True
+    instances = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
+    builder.mesh(builder.primitive(), **instances, **node)
+    return builder
