@@ -182,7 +182,7 @@ def objs() -> list[Files]:
     corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + "vt 0 0\nvt 1 0\nvt 1 1\n"
     faces = "mtllib a.mtl\nvn 0 0 1\nusemtl red\nf 1/1/1 2/2/1 4/3/1\nusemtl plain\nf -1 -2 -4 -3\nf 1 2 6 5 3\n"
     library = b"# Blender 4.1 MTL File\nnewmtl red\nNs 9\n"
-        b"Kd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nmap_d b.png\nnewmtl plain\nKd 0.1 0.2 0.3\nTr 0.4\n"
+    library += b"Kd 1 1 1\nmap_Kd -s 1 1 1 -clamp on a.png\nmap_d b.png\nnewmtl plain\nKd 0.1 0.2 0.3\nTr 0.4\n"
     companions = {"a.mtl": library, "a.png": png(TEXELS[..., :3]), "b.png": png(TEXELS)}
     return [{"mesh.obj": (corners + faces).encode()} | companions, *tables(".obj")]
 
