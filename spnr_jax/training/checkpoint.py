@@ -1,12 +1,14 @@
 """Run folders on disk: the config, and checkpoints of the training state through Orbax.
 
     RUN/config.json          the TrainConfig
+    RUN/data.txt             a checksum of the data set's settings and training objects
     RUN/checkpoints/STEP/    one state; appears complete or not at all
     RUN/training.lock        empty; locked while a process trains there
 
 The newest readable checkpoint counts: if one is damaged, a message names it and the previous one is used.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -20,6 +22,7 @@ import jax
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, first_line
+from spnr_jax.formats.data_sets import Dataset
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.methods import UnknownMethod, from_dict, to_dict
 from spnr_jax.training import optimisation
@@ -57,6 +60,15 @@ def write_config(run: Path, config: TrainConfig) -> None:
             )
         return
     write_whole(path, (json.dumps(to_dict(config), indent=2) + "\n").encode())
+
+
+def is_of(run: Path, dataset: Dataset) -> bool:
+    """Whether the run folder has no checkpoint or is one of this data set; it holds this data set's checksum then."""
+    path, described = run / "data.txt", json.dumps([dataset.settings, dataset.splits["train"]]).encode()
+    known, checksum = path.read_text() if path.is_file() else None, hashlib.sha256(described).hexdigest()
+    if known != checksum:
+        write_whole(path, checksum.encode())
+    return known in (None, checksum) or not (run / "checkpoints").is_dir()
 
 
 def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:

@@ -1,6 +1,6 @@
 """The training loop: reads batches, takes steps, and writes metrics, previews and checkpoints.
 
-    RUN/config.json  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
+    RUN/config.json  data.txt  metrics.jsonl  tensorboard/  previews/STEP.png  checkpoints/STEP/
 
 A run continues from its newest readable checkpoint; the rows of metrics.jsonl after it are dropped, because they will
 be written again.  A loss that is not finite stops the run and names the step; the last checkpoint stays.
@@ -63,6 +63,8 @@ def train(
     batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
     with checkpoint.lock_run(run), ExitStack() as stack:
         checkpoint.write_config(run, config)
+        if not checkpoint.is_of(run, dataset):
+            tqdm.write(f"{run} began with another data set than {dataset.folder}, and goes on with this one")
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
             return state

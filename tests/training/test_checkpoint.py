@@ -6,6 +6,7 @@ import shutil
 
 import jax
 import pytest
+from support import tiny_dataset
 from support.laws import same_bits
 from support.tiny_baselines import SHRUNKEN
 from support.tiny_dataset import CONFIG
@@ -116,3 +117,11 @@ def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
         checkpoint.read_config(tmp_path)
     with pytest.raises(ValueError, match="not a run folder .*spnr train DATA"):
         checkpoint.read_config(tmp_path / "nowhere")
+
+
+def test_a_run_with_a_checkpoint_tells_another_data_set_once(run):
+    one = tiny_dataset.dataset()
+    other = dataclasses.replace(one, splits=one.splits | {"train": one.splits["train"][1:]})
+    assert [checkpoint.is_of(run, dataset) for dataset in (one, one, other, other)] == [True, True, False, True]
+    shutil.rmtree(run / "checkpoints")
+    assert checkpoint.is_of(run, one)
