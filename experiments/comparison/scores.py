@@ -75,7 +75,7 @@ def _measure(
 
 def place_of(out: Path, row: str, name: str, suffix: str) -> Path:
     """The file of an object in a row."""
-    return out / "scores" / row.replace("/", "_") / f"{name}{suffix}"
+    return out / "scores" / row.replace("/", "%2F") / f"{name}{suffix}"
 
 
 def picture_of(out: Path, row: str, measure: Measure, dataset: Dataset, name: str) -> np.ndarray:

@@ -153,7 +153,7 @@ def train(variants: Sequence[Variant], out: Path) -> dict[str, Trained]:
         run, config = out / "runs" / variant.name, variant.config
         about = f"{variant.label}, preset {config.preset}, {config.num_steps} steps"
         print(f"run {place} of {len(variants)}: {about} in {run}", flush=True)
-        if variant.start and not (run / "checkpoints").is_dir():
+        if variant.start and not any(path.name.isdecimal() for path in run.glob("checkpoints/*")):
             state = variant.start(config)
             checkpoint.write_config(run, config)
             checkpoint.save(run, state)

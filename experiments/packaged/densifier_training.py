@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from data_gen import procedural
 from data_gen.make.augmentation import draw_reshaping, reshape
+from data_gen.plan.sources import find_meshes
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes
@@ -69,9 +70,9 @@ class Options:
 def make_records(options: Options) -> None:
     """Writes the record of each object that has none, in random order."""
     jobs: list[tuple[str, Any, int]] = [(f"procedural{i}", i, 0) for i in range(options.objects)]
-    for path in sorted(options.meshes.iterdir()) if options.meshes else []:
-        if path.suffix in (".glb", ".gltf", ".obj", ".ply") and path.stem not in options.left_out:
-            jobs += [(f"{path.stem}.{variant}", path, variant) for variant in range(VARIANTS)]
+    for name, path in find_meshes(options.meshes) if options.meshes else []:
+        if name not in options.left_out:
+            jobs += [(f"{name}.{variant}", path, variant) for variant in range(VARIANTS)]
     for number in np.random.default_rng(0).permutation(len(jobs)):
         name, source, variant = jobs[number]
         file = options.out / "records" / f"{name}.npz"

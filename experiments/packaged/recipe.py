@@ -64,7 +64,7 @@ class Recipe:
     workers: int | None = None
     """Rendering processes (default: one per CPU core)."""
     seed: int = 0
-    """Seed of data and training."""
+    """Seed of the data and of the shader's training; the densifier's is fixed."""
 
 
 def main(recipe: Recipe) -> None:

@@ -123,10 +123,11 @@ class CachedProgram:
         if not all(_is_plain(leaf) for leaf in leaves):
             return self.jitted(*args, **static)
         key = tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tuple(sorted(static.items()))
-        if key not in self.programs:
+        program = self.programs.get(key)  # another thread may make room
+        if program is None:
             make_room()
-            self.programs[key] = self._program(tree, leaves, static, key)
-        return self.programs[key](*leaves)
+            program = self.programs[key] = self._program(tree, leaves, static, key)
+        return program(*leaves)
 
     def _program(self, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> Callable[..., Any]:
         """A function of the leaves; from a trace if programs are cached on disk."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from trimesh.transformations import quaternion_matrix
+from scipy.spatial.transform import Rotation
 
 from spnr_jax.errors import UserError, refusing
 from spnr_jax.formats import assets
@@ -42,7 +42,7 @@ HARMLESS = {  # what a scene looks like without them
     *("EXT_mesh_features", "KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
 }
 MATERIALS = "KHR_materials_"  # of which those that are not modelled are named one by one
-MOTION, SKIN = ("TRANSLATION", "ROTATION", "SCALE"), ("JOINTS_0", "WEIGHTS_0")
+MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}, ("JOINTS_", "WEIGHTS_")
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
 FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
@@ -125,47 +125,55 @@ def list_primitives(file: "GltfFile") -> Iterator[tuple[dict, np.ndarray, np.nda
         if index in world:
             raise UserError(f"its node {index} is reached twice: the scene is not a tree")
         node = nodes[index]
-        own = np.array(node["matrix"], np.float64).reshape(4, 4).T if "matrix" in node else _matrix(**_motion(node))
-        world[index] = parent @ own
+        own = {name: np.array([node[name.lower()]], np.float64) for name in MOTION if name.lower() in node}
+        matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T if "matrix" in node else _matrices(own)[0]
+        world[index] = parent @ matrix
         visible &= node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
         shown += [index] if visible and "mesh" in node else []
         stack += [(child, world[index], visible) for child in reversed(node.get("children", []))]
-    for index in shown:
-        node, joints, instances = nodes[index], None, [np.eye(4)]
+    skins, placed = dict[int, np.ndarray](), 0
+    for node in (nodes[index] | {"world": world[index]} for index in shown):
+        joints, instances = None, np.eye(4)[None]
         if "skin" in node:  # then the place of the node itself does not count
-            skin = document["skins"][node["skin"]]
-            joints = np.stack([world.get(joint, np.eye(4)) for joint in skin["joints"]])
-            if "inverseBindMatrices" in skin:
-                inverse = file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
-                joints = joints @ np.swapaxes(inverse.reshape(-1, 4, 4), 1, 2)
+            joints = skins.get(node["skin"])
+            if joints is None:
+                joints = skins[node["skin"]] = _joints(file, document["skins"][node["skin"]], world)
         elif INSTANCES in node.get("extensions", {}):
-            moves = file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION)
-            if max(map(len, moves.values())) > MOST_REPEATED / PLACING:
-                raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
-            instances = [_matrix(**dict(zip(moves, row, strict=True))) for row in zip(*moves.values(), strict=True)]
-        for instance in instances:
+            instances = _matrices(file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION))
+        if (placed := placed + len(instances)) > MOST_REPEATED / PLACING:
+            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+        for matrix in node["world"] @ instances:
             for primitive in document["meshes"][node["mesh"]]["primitives"]:
-                yield primitive, world[index] @ instance, joints
+                yield primitive, matrix, joints
 
 
-def _motion(node: dict) -> dict[str, Any]:
-    return {name: node[name.lower()] for name in MOTION if name.lower() in node}
+def _matrices(moves: Columns) -> np.ndarray:
+    """The matrices (n, 4, 4) of scales, then rotations (x, y, z, w), then translations, as far as there are any."""
+    count = max(map(len, moves.values()), default=1)
+    if count > MOST_REPEATED / PLACING:
+        raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+    translation, rotation, scale = (moves.get(name, np.tile(plain, (count, 1))) for name, plain in MOTION.items())
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    matrices[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None]
+    matrices[:, :3, 3] = translation
+    return matrices
 
 
-def _matrix(TRANSLATION: Any = (0, 0, 0), ROTATION: Any = (0, 0, 0, 1), SCALE: Any = (1, 1, 1)) -> np.ndarray:
-    """The matrix (4, 4) of a scale, then a rotation (x, y, z, w), then a translation."""
-    x, y, z, w = ROTATION
-    matrix = quaternion_matrix([w, x, y, z])
-    matrix[:3, :3] *= np.asarray(SCALE, np.float64)
-    matrix[:3, 3] = TRANSLATION
-    return matrix
+def _joints(file: "GltfFile", skin: dict, world: dict[int, np.ndarray]) -> np.ndarray:
+    """The matrices (j, 4, 4) by which the joints of a skin move what hangs on them."""
+    joints = np.stack([world.get(joint, np.eye(4)) for joint in skin["joints"]])
+    if "inverseBindMatrices" not in skin:
+        return joints
+    inverse = file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
+    return joints @ np.swapaxes(inverse.reshape(-1, 4, 4), 1, 2)
 
 
 def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray:
-    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four each."""
-    if not {"JOINTS_0", "WEIGHTS_0"} <= columns.keys():
+    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four or more each."""
+    parts = [[columns[name] for name in sorted(columns) if name.startswith(of)] for of in SKIN]
+    if not parts[0] or len(parts[0]) != len(parts[1]):
         raise UserError("has a skin whose vertices name no joints: broken file")
-    numbers, weights = columns["JOINTS_0"], columns["WEIGHTS_0"].astype(np.float64)
+    numbers, weights = np.concatenate(parts[0], axis=1), np.concatenate(parts[1], axis=1).astype(np.float64)
     if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= len(joints):
         raise UserError(f"has vertices on joint {numbers.max()} of {len(joints)}: broken file")
     weights[weights.sum(axis=1) <= 0, 0] = 1
@@ -178,10 +186,18 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     if DRACO in primitive.get("extensions", {}):
         file.unpack_mesh(primitive)
         mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
-    columns = file.columns(primitive["attributes"], "POSITION", "NORMAL", "COLOR_0", *SKIN, texcoords)
-    order = np.arange(len(columns["POSITION"]))
+    attributes = primitive["attributes"]
+    order, used, count = None, None, len(file.accessor(attributes["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+        kept, places = np.unique(order, return_inverse=True)
+        if (
+            len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count
+        ):  # the rest are others' vertices
+            order, used = places, kept
+    names = [name for name in attributes if name.startswith(SKIN)]
+    columns = file.columns(attributes, "POSITION", "NORMAL", "COLOR_0", *names, texcoords, rows=used)
+    order = np.arange(count) if order is None else order
     if mode == "POINTS":
         return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_STRIP":
@@ -231,14 +247,15 @@ class GltfFile:
         self.view, self._buffer = cache(self._read_view), cache(self._read_buffer)
         self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
 
-    def columns(self, attributes: dict[str, int], *names: str) -> Columns:
-        """The columns (v, width) of those of a primitive's attributes that have one of the names.
+    def columns(self, attributes: dict[str, int], *names: str, rows: np.ndarray | None = None) -> Columns:
+        """The columns (v, width) of those of a primitive's attributes that have one of the names; some rows, or all.
 
         float64 for floats and normalised integers, int64 for other ones.
         """
         found = {}
         for name, index in ((name, index) for name, index in attributes.items() if name in names):
             values, normalized = self.accessor(index), self.document["accessors"][index].get("normalized")
+            values = values if rows is None else values[rows]
             if values.dtype.kind == "f":
                 found[name] = values.astype(np.float64)
             elif normalized or name == "COLOR_0":  # which always is; some writers forget to say so
@@ -257,6 +274,8 @@ class GltfFile:
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
         stride, view = self.document["bufferViews"][number].get("byteStride", dtype.itemsize * width), self.view(number)
+        if stride < width * dtype.itemsize:
+            raise UserError(f"buffer view {number} has elements that overlap: broken file")
         if count and start + (count - 1) * stride + width * dtype.itemsize > len(view):
             raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
         return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))

@@ -65,6 +65,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     parts = _parts(text, stack_columns(columns), colors, looks, moves, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
+    if text["l"]:
+        loading.ignored.add("lines")
     if text["vn"] and any(part.normals is None for part in parts):
         loading.ignored.add("normals that only some faces have (flat shading is used)")
     return parts
@@ -72,7 +74,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 def _parse(content: str) -> Rests:
     """The rests of lines by their keyword; of faces all corners, words like 1/2/3 from 1, sizes and materials."""
-    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "usemtl", "mtllib", "surf")}
+    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf")}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     for line in content.replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
@@ -103,13 +105,16 @@ def _columns(text: Rests, loading: Loading) -> Columns:
     rows, lengths = text["v"], [len(row.partition("#")[0].split()) for row in text["v"]]
     if {*lengths} == {3, 6}:
         loading.say(f"{lengths.count(3):,} of {len(rows):,} vertices have no colour: white taken")
-        rows = [row.partition("#")[0] + " 1 1 1" * (length == 3) for row, length in zip(rows, lengths, strict=True)]
+        rows = [row.partition("#")[0] + " nan nan nan" * (n == 3) for row, n in zip(rows, lengths, strict=True)]
     try:
         table = _table(rows, None)
     except ValueError as error:
         if "number of columns" not in str(error):
             raise
         raise UserError("has vertices of different lengths: it is broken, or give colours to all of them") from None
+    if {*lengths} == {3, 6}:
+        bare = np.array(lengths) == 3
+        table[bare, 3:] = full_scale(table.dtype, float(table[~bare, 3:].max()))
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
     return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
@@ -133,7 +138,7 @@ def _parts(
             raise UserError(f"has faces that name {keyword} {last} of {count}: broken file")
     of_v, of_vt, of_vn = corners.T - 1
     positions, colors = positions[of_v], None if colors is None else colors[of_v]
-    texcoords = _table([*text["vt"], "0 0"], 2)[of_vt]
+    texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2)[of_vt]  # one number is that along a line
     normals = _table([*text["vn"], "0 0 0"], 3)[of_vn]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
     number = {name: i for i, name in enumerate(looks)}
@@ -204,12 +209,11 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict
     maps: dict[str, np.ndarray] = {}
     wrap: assets.Wrap = "repeat"
     for key in MAPS:
-        statement, options = entry.get(key, ""), {}
-        while option := OPTION.match(statement):
-            options[option[1]] = option[2].split()
-            statement = statement[option.end() :]
+        statement, options, place = entry.get(key, ""), {}, 0
+        while option := OPTION.match(statement, place):
+            options[option[1]], place = option[2].split(), option.end()
         ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
-        file = statement.strip("\"' \t").replace("\\", "/")
+        file = statement[place:].strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
             own = np.array(
                 [[float(x) for x in (*options.get(of, ()), *2 * plain)[:2]] for of, plain in (("s", "1"), ("o", "0"))]

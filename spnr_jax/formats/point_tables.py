@@ -54,7 +54,9 @@ COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of colu
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of Windows, of databases
-UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^)\]]*[)\]]")  # no numbers: CloudCompare's roughness by radius is no material
+UNITS = re.compile(
+    r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]"
+)  # no numbers: CloudCompare's roughness by radius is no material
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
@@ -214,7 +216,9 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     whole = (table % 1 == 0).all(axis=0)
     pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # by row and column
     if first := 2 if pictured else int(timed or np.all(steps == 1)):
-        report(f"columns before x y z, which number or time the points: {first}")
+        report(
+            f"columns before x y z, which number or time the points: {first} (if not, name the columns in a first line)"
+        )
         return (*first * [INDEX], *plain_names(table[:, first:], report))
     if (known := np.isfinite(table).all(axis=1)).any():
         table = table[known]
@@ -298,6 +302,8 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
+    if not rows.dtype.itemsize:
+        raise UserError("holds records without bytes; expected points")
     fields = rows.dtype.names
     rows = rows.reshape(-1) if fields else _as_rows(rows, report)
     names = fields or plain_names(rows[:PIECE_LINES], report)

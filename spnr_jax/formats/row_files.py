@@ -60,7 +60,8 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
             lengths = {name: int(found[0][0]) for name, found in _any_rows(file, 1, properties, text, done)[1].items()}
             file.seek(place)
         layout, words = _layout(properties, lengths)
-        wanted = min(count - done, PIECE_LINES if text or lists else max(1, PIECE_BYTES // max(1, layout.itemsize)))
+        fitting = max(1, PIECE_BYTES // max(1, layout.itemsize))
+        wanted = min(count - done, PIECE_LINES if text or lists else fitting, PIECE_LINES if text else fitting)
         try:
             lines = list(enumerate(islice(_lines(file), wanted), done)) if text else []
             data = b"" if text else file.read(wanted * layout.itemsize)

@@ -8,7 +8,8 @@ installed and finds its weights.  Both are 0 for the same picture.
 Scores come by object, an array (views,) each; NaN is a view without a score and is left out, None stands where there is
 no number.  Views of one object are not independent, so objects are drawn, each with all its views, and the interval is
 that of the mean over views.  It is a percentile bootstrap; with few objects these are too narrow, so the levels are
-widened to those that are exact for the mean of normal scores (Hesterberg 2015, "expanded percentile").  Differences are
+widened to those that are exact for the mean of normal scores (Hesterberg 2015, "expanded percentile"), and with fewer
+than FEWEST there is none.  Differences are
 taken view by view, so what makes an object hard for both methods cancels; their p-value is that of a sign-flip test
 over objects.  Objects are sorted before anything is drawn: their order does not matter.
 """
@@ -71,6 +72,7 @@ def _views(pictures: AnyArray) -> Float[np.ndarray, "views height width 3"]:
 
 METRICS = ("psnr", "ssim", "cpsnr", "flip", "lpips", "iou")
 RESAMPLES, LEVEL, SEED = 10_000, 0.95, 0
+FEWEST = 5  # objects, below which no percentile of resampled means is as wide as an interval should be
 
 Scores = dict[str, np.ndarray]  # metric -> score of each view (views,); cpsnr is NaN where no point is visible
 
@@ -139,11 +141,11 @@ def difference(first: Sequence[Scores], second: Sequence[Scores], metric: str) -
 
 
 def interval(scores: Sequence[np.ndarray]) -> list[float] | None:
-    """Ends of the bootstrap interval of the mean over all views; None of fewer than two objects with a score."""
+    """Ends of the bootstrap interval of the mean over all views; None of fewer than FEWEST objects with a score."""
     from scipy.stats import bootstrap
 
     sums, counts = _by_object(scores)
-    if len(sums) < 2:
+    if len(sums) < FEWEST:
         return None
     found = bootstrap(
         (sums, counts),

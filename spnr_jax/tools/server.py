@@ -179,7 +179,7 @@ class Browser:
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
         self._light: dict[str, Any] = {}
-        self.loop = Loop(first, self._draw)
+        self.loop = Loop(first, lambda state, moving: self._try(lambda: self._draw(state, moving)))
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
         self._status = gui.add_markdown(PREPARING)
@@ -217,10 +217,10 @@ class Browser:
         self.loop.submit(lambda state: frame.relight(state, lighting))
 
     def _try(self, work: Callable[[], None]) -> None:
-        """Run the callback of a control; errors that the user can fix become a notification."""
+        """Draw, or run the callback of a control; errors of the user and a want of memory become a notification."""
         try:
             work()
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, MemoryError, RuntimeError) as error:
             message = " ".join(str(error).split())[:LONGEST_NOTE]
             self._client.add_notification("That did not work", message, auto_close_seconds=10, color="red")
 

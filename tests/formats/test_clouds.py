@@ -276,7 +276,7 @@ def test_a_box_and_an_object_are_cut_out_of_a_mesh(tmp_path, monkeypatch):
         ({"crop": (1.0, 0.0, 0.0, 0.0, 1.0, 1.0)}, "--crop takes xmin .* zmax, each min up to its max"),
         ({"crop": (np.nan, 0.0, 0.0, 1.0, 1.0, 1.0)}, "--crop takes xmin ymin zmin xmax ymax zmax"),
         ({"up": "w"}, "up must be one of y, -y, z, -z, x, -x, auto, got 'w'"),
-        ({"num_points": 0}, "num_points must be at least 1, got 0"),
+        ({"num_points": 0}, "num_points must be a whole number of at least 1, got 0"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_before_the_file_is_touched(options, expected):

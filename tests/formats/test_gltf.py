@@ -80,6 +80,27 @@ def test_a_skin_lies_where_its_joints_put_it_whatever_its_own_node_says(tmp_path
     assert not asset.ignored
 
 
+def test_a_vertex_hangs_on_more_than_four_joints(tmp_path):
+    builder = skinned()
+    more = {"JOINTS_1": np.full((4, 4), 1, np.uint8), "WEIGHTS_1": np.tile(np.float32([0.5, 0, 0, 0]), (4, 1))}
+    attributes = builder.document["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {name: builder.accessor(values) for name, values in more.items()}
+    builder.document["skins"][0]["joints"].append(builder.node(translation=[0, 0, 8]))
+    (part,) = load_mesh(builder.write(tmp_path / "skin.glb")).parts
+    assert corners_in_space(part) == {(x, y, 4) for x, y, _ in CORNERS}
+
+
+def test_of_vertices_that_parts_share_each_keeps_its_own(tmp_path):
+    builder = GltfBuilder()
+    whole = builder.primitive(np.concatenate([CORNERS, CORNERS + [0, 0, 5]]).astype(np.float32))
+    other = whole | {"indices": builder.accessor(SQUARE + np.uint16(4)), "material": builder.material(doubleSided=True)}
+    builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [1, 0, 0, 1]}
+    builder.mesh(whole, other)
+    parts = load_mesh(builder.write(tmp_path / "shared.glb")).parts
+    assert [len(part.positions) for part in parts] == [4, 4]
+    assert [{z for _, _, z in corners_in_space(part)} for part in parts] == [{0}, {5}]
+
+
 def test_instances_are_drawn_each_in_its_place_and_hidden_nodes_with_their_children_are_not(tmp_path):
     builder = instanced(scale=[2, 2, 2])
     child = builder.mesh(builder.primitive(CORNERS * 9), root=False)
@@ -156,6 +177,7 @@ REFUSED = (
     (square(indices=np.array([0, 1, 9], np.uint16)), "vertices 0 to 9 of 4"),
     (square(NORMAL=np.ones((3, 3), np.float32)), "normals of shape (3, 3) where (4, 3) is needed"),
     (square(change=lambda d: d["nodes"][0].update(children=[0])), "not a tree"),
+    (square(change=lambda d: d["bufferViews"][0].update(byteStride=0)), "elements that overlap"),
 )
 
 

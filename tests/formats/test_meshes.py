@@ -217,6 +217,10 @@ def test_two_libraries_in_one_line_and_vertices_of_which_some_have_a_colour_are_
     mixed = VERTICES.replace("0 0 0", "0 0 0 1 0 0 # red") + "v -nan(ind) 0 0\nf 1 2 3\nf 1 3 4\nf 1 2 5\n"
     asset = load_mesh(write_obj(tmp_path, mixed), transparent_parts="opaque")
     np.testing.assert_array_equal(asset.parts[0].colors, [[1, 0, 0], *3 * [[1, 1, 1]]])
+    bytes_of_one = write_obj(tmp_path, mixed.replace("0 0 0 1 0 0", "0 0 0 255 0 0") + "l 1 2\n")
+    asset = load_mesh(bytes_of_one, transparent_parts="opaque")
+    np.testing.assert_array_equal(asset.parts[0].colors, [[1, 0, 0], *3 * [[1, 1, 1]]])
+    assert "lines" in asset.ignored
     assert any("4 of 5 vertices have no colour" in note for note in asset.notes)
 
 

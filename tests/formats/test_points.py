@@ -487,6 +487,7 @@ REFUSED = [
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
     ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
     ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
+    ("a.npy", as_npy(np.zeros(3, [("x", "<f4", (0,))])), "records without bytes"),
     ("a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 9001) + b"~" * 9000 + b"1", "a broken, truncated or pickled"),
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),

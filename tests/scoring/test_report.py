@@ -181,9 +181,8 @@ class TestEvaluation:
         assert all(name in page for name in tiny_dataset.SPLITS["test"])
         best = max(("white", "splat", "nearest"), key=lambda name: metrics["methods"][name]["psnr"])
         found = metrics["paper_minus"][best]["psnr"]
-        low, high = found["interval"]
-        expected = f"{found['mean']:+.2f} dB [{low:+.2f}, {high:+.2f}] against the best trivial renderer ({best})"
-        assert expected in page
+        assert found["interval"] is None  # of three objects
+        assert f"{found['mean']:+.2f} dB against the best trivial renderer ({best})" in page
 
     def test_what_does_not_exist_is_null_and_what_is_not_finite_is_refused(self, outcome, tmp_path):
         rows = {name: row | {"cpsnr": None, "cpsnr_views": 0} for name, row in outcome.summary["methods"].items()}

@@ -56,6 +56,12 @@ def test_ids_are_unique_even_where_letter_case_and_cleaning_collide(tmp_path):
     assert all(name[0] not in "._-" for name in found)
 
 
+def test_no_id_is_that_of_a_variant(tmp_path):
+    found = ids(tmp_path, "chair.glb", "chair--1.glb", "chair-1.glb")
+    assert len(found) == 3
+    assert not any("--" in name for name in found)
+
+
 # Amazon Berkeley Objects
 
 PRODUCTS = [f"B07{number:06d}{letter}" for number, letter in enumerate("LL91ABC")]
