@@ -155,9 +155,11 @@ def _parts(
         name, material = list(looks.items())[code // 4]
         assert material is not None
         part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
-        scale, offset = moves.get(name, UNMOVED)
-        moved = (texcoords * scale + offset) * [1, -1] + [0, 1]  # v is from the lower edge
-        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=moved if code & 2 else None))
+        if code & 2:
+            scale, offset = moves.get(name, UNMOVED)
+            there = texcoords if (moves.get(name, UNMOVED) == UNMOVED).all() else texcoords * scale + offset
+            part = replace(part, texcoords=there * [1, -1] + [0, 1])  # v is from the lower edge
+        parts.append(replace(part, normals=normals) if code & 1 else part)
     return parts
 
 

@@ -54,9 +54,7 @@ COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of colu
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of Windows, of databases
-UNITS = re.compile(
-    r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]"
-)  # no numbers: CloudCompare's roughness by radius is no material
+UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # no numbers: CloudCompare's roughness has a radius
 INDEX = "index"  # the name of a column that only counts
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
 PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
@@ -240,12 +238,8 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     if names[3:4] == ["scalar"]:
         names[3] = "intensity"
     if count > 3:
-        doubt = (
-            f"; r g b may as well be columns {close[0] + 1} to {close[0] + 3}: name them in a first line"
-            if close
-            else ""
-        )
-        report(f"the {count} columns, which have no names, taken as {' '.join(names)}{doubt}")
+        others = [f"; r g b may as well be columns {i + 1} to {i + 3}: name them in a first line" for i in close[:1]]
+        report(f"the {count} columns, which have no names, taken as {' '.join(names)}{''.join(others)}")
     return tuple(names)
 
 

@@ -45,12 +45,8 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
     if texcoords is not None and images and all(image is not None for image in images):
         return _textured(useful(vertices), corners, sizes, texcoords, of_faces.get("texnumber"), images)
-    if (
-        texcoords is not None
-        or "texcoord" in lists
-        or header.textures
-        or any("texture" in name for name, *_ in header.elements)
-    ):
+    told = header.textures or any("texture" in name for name, *_ in header.elements)
+    if texcoords is not None or "texcoord" in lists or told:
         loading.ignored.add("texture coordinates")
     return _colored(vertices, corners, sizes, of_faces, loading)
 
