@@ -69,8 +69,9 @@ def compute_visibility(
     """
     positions, normals, spacing, cell = jax.lax.stop_gradient((positions, normals, spacing, cell))
 
-    def number_of(column, row):
-        return jnp.clip(row, 0, grid - 1) * grid + jnp.clip(column, 0, grid - 1)
+    def number_of(column, row):  # counted from the middle, so that a larger grid rounds nothing otherwise
+        row, column = (jnp.clip(i + grid // 2, 0, grid - 1) for i in (row, column))
+        return row * grid + column
 
     def beside(column, row, right, up, slopes):
         """How much nearer a plane through (right, up), in cells, is at the centre of a cell."""
@@ -82,7 +83,7 @@ def compute_visibility(
         steep = [-dot(axis, normals) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)]
         slope = jnp.sqrt(steep[0] ** 2 + steep[1] ** 2)
         steep = [x * jnp.minimum(1, STEEPEST / jnp.maximum(slope, 1e-3)) for x in steep]
-        across, high = (dot(axis, positions) / cell + grid / 2 for axis in (right, up))
+        across, high = (dot(axis, positions) / cell for axis in (right, up))
         column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
         depth = dot(towards, positions)
         most = RADIUS * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
@@ -93,7 +94,7 @@ def compute_visibility(
             index = jnp.where(mask, number_of(column + i, row + j), grid * grid)
             nearest = nearest.at[index].max(there, mode="drop")
         lifted = positions + (jnp.sign(facing) * spacing)[None] * normals
-        across, high = (dot(axis, lifted) / cell + grid / 2 for axis in (right, up))
+        across, high = (dot(axis, lifted) / cell for axis in (right, up))
         column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
         there = dot(towards, lifted) + beside(column, row, across, high, steep)
         behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
