@@ -36,7 +36,7 @@ from spnr_jax.formats.columns import (
     sound,
     useful,
 )
-from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, sensor_of
+from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, holds_splats, sensor_of
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import SurfacePoints, bounding_box, sample_surface, vertex_points
 from spnr_jax.kernels import cloud_arrays, scenes
@@ -181,7 +181,11 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
         values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
         of_camera = sensor and sensor.up
-        up, reason = (of_camera, "that of its camera") if of_camera else find_up(positions, kind)
+        up, reason = (
+            (of_camera, "that of its camera")
+            if of_camera
+            else find_up(positions, kind, of_splats=holds_splats(path, kind))
+        )
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
     if "normals" in values:

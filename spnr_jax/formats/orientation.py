@@ -48,15 +48,24 @@ FARTHEST = 1e30  # units, beyond which no sensor and no point lies: galaxies are
 PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
-def find_up(positions: np.ndarray, kind: str) -> tuple[str, str]:
-    """(up axis, how it was found) of points (n, 3) from a file of a kind."""
+def find_up(positions: np.ndarray, kind: str, *, of_splats: bool = False) -> tuple[str, str]:
+    """(up axis, how it was found) of points (n, 3) from a file of a kind; splats of a .ply have y down."""
     if kind in BY_FORMAT:
         return BY_FORMAT[kind], f"by the format {kind}"
     positions = positions[:: -(-len(positions) // MOST_STANDING)]
     normals = estimate_normals(positions, cKDTree(positions))
     scores = {axis: standing(positions, normals, "xyz".index(axis)) for axis in "yz"}
-    up = "z" if scores["z"] > scores["y"] + MARGIN else "y"
-    return up, f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"
+    up, reason = "z" if scores["z"] > scores["y"] + MARGIN else "y", f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"
+    return ("-y", f"{reason}; splats have y down") if of_splats and up == "y" else (up, reason)
+
+
+def holds_splats(path: Path, kind: str) -> bool:
+    """Whether it is a .ply of Gaussian splats: their tools write axes right, down, forward."""
+    if kind != ".ply":
+        return False
+    with path.open("rb") as file:
+        elements = read_header(file, kind).elements
+    return any(name in ("rot_0", "packed_rotation") for _, _, properties in elements for name, *_ in properties)
 
 
 def standing(positions: np.ndarray, normals: np.ndarray, axis: int) -> float:

@@ -13,7 +13,7 @@ from support.point_clouds import BALL, GREEN, LINEAR, packed_splats, write
 
 from spnr_jax.config import Cut
 from spnr_jax.formats import gaussian_files
-from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.formats.point_files import parse_ply
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.gaussians import C0, rotation_matrices
@@ -53,6 +53,16 @@ def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
 
 
 # Read as clouds
+
+
+def test_splats_come_back_upright_from_either_file(tmp_path):
+    splats = splat_balls.ball(300)
+    places = np.asarray(splats.position)
+    stands = splats.replace(position=np.stack([places[:, 0], np.maximum(places[:, 1], -0.1), places[:, 2]], axis=1))
+    for name in ("a.ply", "a.spz"):
+        gaussian_files.write_splats(str(tmp_path / name), stands)
+        placed = place_cloud(tmp_path / name, up="auto")
+        np.testing.assert_allclose(placed.cloud.positions, stands.position, atol=1e-3)
 
 
 def test_our_own_spz_files_and_those_of_version_2_are_read_and_others_are_named(tmp_path):
