@@ -34,7 +34,7 @@ PLACES = ("out", "workers", "root", "meshes", "objects", "envmap", "lights", "te
 
 
 def describe(plan: Plan, variant: str) -> dict:
-    """The content of dataset.json: what decides the bytes, but for the content of meshes; not where or how fast."""
+    """The content of dataset.json: options and names that decide the bytes, nothing of where or how fast."""
     config, (source, category) = plan.config, source_of(plan.config)
     settings = {name: value for name, value in asdict(config).items() if name not in PLACES}
     for name, first in (("reshape_variants", False), ("spread", "random")):

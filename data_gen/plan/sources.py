@@ -116,5 +116,5 @@ def find_meshes(folder: Path) -> list[tuple[str, Path]]:
 
 
 def _safe(name: str) -> str:
-    """A name of letters, digits, dot, dash and underscore that is no hidden folder, and no variant's (two dashes)."""
+    """A name of letters, digits, dot, dash, underscore that is no hidden folder; no two dashes, which mark variants."""
     return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9._-]+", "_", name)).strip("._-") or "object"

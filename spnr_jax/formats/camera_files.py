@@ -20,7 +20,7 @@ from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
-SIZE = 512  # pixels along each side where a file tells none
+SIZE, PIXELS = 512, {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # along each side where a file tells nothing in pixels
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
 
 
@@ -71,7 +71,7 @@ def cameras_of(
         raise UserError("no frames")
     entries = ({**document, **frame} for frame in frames)
     square = {"w": size, "h": size}
-    sized = (square | of if not square.keys() & of.keys() and "camera_angle_x" in of else of for of in entries)
+    sized = (square | of if "camera_angle_x" in of and not PIXELS & of.keys() else of for of in entries)
     return [_camera(of, number, turn, place) for number, of in enumerate(sized)]
 
 

@@ -36,7 +36,7 @@ ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
 PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
 PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
-HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "el", "up", "höhe", "hoehe", "cota")
+HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "höhe", "hoehe", "cota")
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
 ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
     ours: [[name.replace("_", "") for name in ours]]
@@ -44,13 +44,13 @@ ALIASES = {  # ours -> what stands for it, without separators; the first group t
     + [names.split() for names in others.split("|") if names]
     for ours, stems, others in (
         (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
-        (LINEAR, "basecolor albedo linear cd", ""),  # the last is Houdini's
-        (SRGB, "color colors rgb rgbs diffuse vertex col", "r g b|rf gf bf|fr fg fb|r8 g8 b8"),
+        (LINEAR, "basecolor albedo cd", "linearr linearg linearb|linearred lineargreen linearblue"),  # Houdini: Cd
+        (SRGB, "color colors rgb rgbs diffuse vertex", "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb"),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
         (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
-        (("alpha",), "", "a r g b|a red green blue|diffusealpha|colora|rgb3|color3|colors3"),
+        (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
         (("opacity",), "", "opacities"),
         *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
@@ -113,6 +113,9 @@ def rename(columns: Columns) -> Columns:
     for ours, words in WORDS:
         if ours[0] not in found:
             found |= dict(zip(ours, map(columns.__getitem__, _differing(columns, words)), strict=False))
+    colored = any(set(names) <= found.keys() for names in (LINEAR, SRGB, ("rgb",)))
+    if not colored and found.get("alpha") is plain.get("a"):  # a name that beside no colours may mean anything
+        found.pop("alpha", None)
     if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
             found[name] = np.clip(0.5 + C0 * np.asarray(columns[constant], np.float64), 0, 1)

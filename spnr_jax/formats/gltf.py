@@ -37,8 +37,9 @@ DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_
 BASIS, WEBP, MOVED = "KHR_texture_basisu", "EXT_texture_webp", "KHR_texture_transform"
 INSTANCES, VISIBILITY, SPLATS = "EXT_mesh_gpu_instancing", "KHR_node_visibility", "KHR_gaussian_splatting"
 READ = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCES, VISIBILITY, SPLATS, "KHR_mesh_quantization"}
-HARMLESS = {  # what a scene looks like without them
-    *("KHR_lights_punctual", "KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata"),
+LIGHTS = "KHR_lights_punctual"
+HARMLESS = {  # a scene looks the same without them
+    *(LIGHTS, "KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata"),
     *("EXT_mesh_features", "KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
 }
 MATERIALS = "KHR_materials_"  # of which those that are not modelled are named one by one
@@ -72,7 +73,8 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     # points are read where there is nothing else
     wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
     ignored |= {"animations"} & document.keys()
-    ignored |= {name for name in {*document.get("extensionsUsed", [])} - READ if not name.startswith(MATERIALS)}
+    unknown = {*document.get("extensionsUsed", [])} - READ - (HARMLESS - {LIGHTS})
+    ignored |= {name for name in unknown if not name.startswith(MATERIALS)}
     read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
@@ -98,7 +100,10 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
-        matrix = matrix if joints is None else _bend(columns, joints)
+        if joints is not None and all(any(name.startswith(of) for name in columns) for of in SKIN):
+            matrix = _bend(columns, joints)
+        elif joints is not None:
+            ignored.add("skins of vertices that name no joints")
         part = _place(columns, faces, material, placement, matrix)
         if (asks_alpha or mode == "POINTS") and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
             ignored |= {"alpha of vertex colours"} if asks_alpha else set()
@@ -152,7 +157,10 @@ def _matrices(moves: Columns) -> np.ndarray:
     count = max(map(len, moves.values()), default=1)
     if count > MOST_REPEATED / PLACING:
         raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+    if any(len(move) != count for move in moves.values()):
+        raise UserError("has instances with several numbers of places, turns or sizes: broken file")
     translation, rotation, scale = (moves.get(name, np.tile(plain, (count, 1))) for name, plain in MOTION.items())
+    rotation = np.where(rotation.any(axis=1, keepdims=True), rotation, MOTION["ROTATION"])
     matrices = np.tile(np.eye(4), (count, 1, 1))
     matrices[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None]
     matrices[:, :3, 3] = translation
@@ -162,18 +170,22 @@ def _matrices(moves: Columns) -> np.ndarray:
 def _joints(file: "GltfFile", skin: dict, world: dict[int, np.ndarray]) -> np.ndarray:
     """The matrices (j, 4, 4) by which the joints of a skin move what hangs on them."""
     joints = np.stack([world.get(joint, np.eye(4)) for joint in skin["joints"]])
-    if "inverseBindMatrices" not in skin:
-        return joints
-    inverse = file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
-    return joints @ np.swapaxes(inverse.reshape(-1, 4, 4), 1, 2)
+    if "inverseBindMatrices" in skin:
+        inverse = file.accessor(skin["inverseBindMatrices"]).astype(np.float64)
+        if len(inverse) < len(joints):
+            raise UserError(f"has {len(joints)} joints in a skin and {len(inverse)} matrices of them: broken file")
+        joints = joints @ np.swapaxes(inverse[: len(joints)].reshape(-1, 4, 4), 1, 2)
+    elsewhere = [joint not in world for joint in skin["joints"]]  # in another scene: what hangs on it is at rest
+    return np.where(np.array(elsewhere)[:, None, None], np.eye(4), joints)
 
 
 def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray:
     """The matrices (v, 4, 4) of vertices by the joints that they hang on, four or more each."""
     parts = [[columns[name] for name in sorted(columns) if name.startswith(of)] for of in SKIN]
-    if not parts[0] or len(parts[0]) != len(parts[1]):
-        raise UserError("has a skin whose vertices name no joints: broken file")
     numbers, weights = np.concatenate(parts[0], axis=1), np.concatenate(parts[1], axis=1).astype(np.float64)
+    if numbers.shape != weights.shape:
+        raise UserError("has a skin with other numbers of joints than of weights: broken file")
+    numbers = np.where(weights > 0, numbers, 0).astype(np.int64)  # joints without weight may be any
     if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= len(joints):
         raise UserError(f"has vertices on joint {numbers.max()} of {len(joints)}: broken file")
     weights[weights.sum(axis=1) <= 0, 0] = 1
@@ -191,10 +203,9 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
         kept, places = np.unique(order, return_inverse=True)
-        if (
-            len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count
-        ):  # the rest are others' vertices
-            order, used = places, kept
+        whole = all(len(file.accessor(index)) == count for index in attributes.values())
+        if whole and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
+            order, used = places, kept  # the other vertices are those of other primitives
     names = [name for name in attributes if name.startswith(SKIN)]
     columns = file.columns(attributes, "POSITION", "NORMAL", "COLOR_0", *names, texcoords, rows=used)
     order = np.arange(count) if order is None else order
@@ -210,7 +221,8 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
 def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Placement", matrix: np.ndarray) -> Part:
     """One primitive in world space, by one matrix (4, 4) or one for each vertex (v, 4, 4)."""
     linear = matrix[..., :3, :3]
-    side = -1 if np.median(np.linalg.det(linear)) < 0 else 1
+    turned_over = np.linalg.det(linear) < 0
+    side = -1 if 2 * np.sum(turned_over) > np.size(turned_over) else 1
     # of the matrix, a multiple of the inverse transpose that is defined where it is singular too
     cofactors = np.cross(np.roll(linear, -1, axis=-2), np.roll(linear, -2, axis=-2))
     normals, colors, texcoords = (columns.get(name) for name in ("NORMAL", "COLOR_0", f"TEXCOORD_{place.texcoord_set}"))
@@ -225,7 +237,7 @@ def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Plac
 
 
 def _turned(vectors: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    return (linear @ vectors[..., None])[..., 0]
+    return vectors @ linear.T if linear.ndim == 2 else (linear @ vectors[..., None])[..., 0]
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -273,10 +285,11 @@ class GltfFile:
             raise UserError(f"accessor {index} is sparse or holds no data, which is not read: export it plain")
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
-        stride, view = self.document["bufferViews"][number].get("byteStride", dtype.itemsize * width), self.view(number)
-        if stride < width * dtype.itemsize:
+        size, view = dtype.itemsize * width, self.view(number)
+        stride = self.document["bufferViews"][number].get("byteStride") or size
+        if stride < size:
             raise UserError(f"buffer view {number} has elements that overlap: broken file")
-        if count and start + (count - 1) * stride + width * dtype.itemsize > len(view):
+        if count and start + (count - 1) * stride + size > len(view):
             raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
         return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
 

@@ -1,9 +1,9 @@
 """Wavefront OBJ + MTL as parts; vertex colours are read as those of points are (columns.py).
 
 Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
-a map; roughness is Pr, else 1 - sqrt(Ns / 1000) by Blender's exporter and sqrt(2 / (Ns + 2)) by others, at least 0.5
-without a highlight (Ks 0, illum 0 or 1), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (a cut-out at
-a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with the same
+a map; roughness is Pr, else 1 - sqrt(Ns / 1000) by Blender's exporter (its first: 900), else sqrt(2 / (Ns + 2)) where
+there is a highlight (no Ks 0, illum 0 or 1), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (cut out
+at a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with the same
 three corners, as ShapeNet has for the two sides, one is kept, that of the material used first.
 """
 
@@ -25,7 +25,7 @@ Rests = dict[str, list]
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 UNMOVED = np.array([[1.0, 1.0], [0.0, 0.0]])  # scale and offset of texture coordinates
 NEARLY_GREY = 16  # of 255: between the channels of a grey JPEG
-READ = {"kd", "pr", "pm", "ns", "d", "tr", *MAPS}
+READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
 SHININESS = re.compile(r"\s*# Blender( MTL)?")  # of an MTL by Blender: Ns is 1000 (1 - roughness)^2, once 900
 OPTION = re.compile(
@@ -50,8 +50,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         none = np.zeros((0, 3), np.int64)
         return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
-    for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+", names.strip())):
-        library |= parse_mtl(loading.read(name) or b"")
+    for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+(?!#)", names.strip())):
+        library |= parse_mtl(loading.read(name.partition(" #")[0]) or b"")
     looks: dict[str, Material | None] = {}
     moves: dict[str, np.ndarray] = {}
     for name in dict.fromkeys(text["usemtl"]):
@@ -178,7 +178,7 @@ def _first_of_doubles(corners: np.ndarray) -> np.ndarray:
 def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     """Statements of an MTL file: material name -> keyword in lower case -> rest of the line.
 
-    Of Blender's also `pr`, the roughness that Ns stands for there.
+    Of Blender's also `blender`, the Ns of its least roughness.
     """
     library: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
@@ -191,9 +191,8 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
             current = library.setdefault(rest.strip(), {})
         elif keyword and not keyword.startswith("#"):
             current[keyword.lower()] = re.sub(r"\s#.*", "", rest).strip()
-    for entry in library.values():
-        if shiniest and "ns" in entry:
-            entry.setdefault("pr", str(1 - min(max(float(entry["ns"]) / shiniest, 0), 1) ** 0.5))
+    for entry in library.values() if shiniest else ():
+        entry["blender"] = str(shiniest)
     return library
 
 
@@ -217,9 +216,10 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict
         ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
         file = statement[place:].strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
-            own = np.array(
-                [[float(x) for x in (*options.get(of, ()), *2 * plain)[:2]] for of, plain in (("s", "1"), ("o", "0"))]
-            )
+            own = UNMOVED.copy()
+            for row, letter in enumerate("so"):
+                numbers = [float(x) for x in options.get(letter, ()) if not x.isalpha()][:2]
+                own[row, : len(numbers)] = numbers
             if (moves.setdefault(name, own) != own).any():
                 ignored.add("second texture with its own coordinates")
             maps[key] = texels
@@ -234,9 +234,11 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
         color = decode_texels(maps["map_kd"][..., :3], assets.SRGB_TABLE)
-    shiny = np.sqrt(2 / (max(float(entry["ns"]), 0) + 2)) if "ns" in entry else 0.5
-    if entry.get("illum") in ("0", "1") or not entry.get("ks", "1").strip("0. "):
-        shiny = max(shiny, 0.5)
+    shiny, highlight = 0.5, max(float(entry.get("ns", 0)), 0)
+    if "ns" in entry and "blender" in entry:
+        shiny = 1 - min(highlight / float(entry["blender"]), 1) ** 0.5
+    elif "ns" in entry and entry.get("illum") not in ("0", "1") and entry.get("ks", "1").strip("0. "):
+        shiny = (2 / (highlight + 2)) ** 0.5
     roughness, metallic = (
         decode_texels(maps[f"map_{key}"][..., 0]) if f"map_{key}" in maps else float(entry.get(key, plain))
         for key, plain in (("pr", shiny), ("pm", 0))
@@ -251,7 +253,7 @@ def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> tuple[str, np.nda
         if map_d is None:
             return "map_d", np.ones(()), assets.MOSTLY_OPAQUE
         # a grey picture, or the alpha of another, which is opaque where it has none
-        own = entry["map_d"] != entry.get("map_kd") and np.ptp(map_d[..., :3].astype(int), axis=-1).max() <= NEARLY_GREY
+        own = entry["map_d"] != entry.get("map_kd") and np.ptp(map_d[..., :3], axis=-1).max() <= NEARLY_GREY
         alpha = map_d[..., 0 if own and map_d[..., 3].min() == 255 else 3]
         return "map_d", decode_texels(alpha), assets.MOSTLY_OPAQUE
     if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:

@@ -51,6 +51,8 @@ TEXTS = (
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
 ARRAYS = "save its points in Python with np.savez(file, points=..., colors=...)"
+REAL = rb"[-+.\deE]+[ \t]*"  # columns and rows of the scan, four rows of three numbers, then of four
+PTX_HEAD = rb"(?:\d+\s*\n){2}(?:(?:" + REAL + rb"){3}\r?\n){4}(?:" + REAL + rb"){4}\r?\n"
 # what is not read: its name if not that of the suffix, suffixes, how it begins (groups: its version), how to convert it
 FOREIGN = (
     ("USD (binary crate)", "", rb"PXR-USDC(.)(.)(.)", BLENDER),
@@ -64,7 +66,7 @@ FOREIGN = (
     ("3D Tiles", ".b3dm .i3dm .pnts .cmpt", b"", "convert it to .glb or .las first"),
     ("E57", ".e57", rb"ASTM-E57(.{4})(.{4})", CLOUDCOMPARE),
     ("", ".ptx .rcp .rcs .fls", b"", CLOUDCOMPARE),
-    ("PTX", "", rb"\d+\s*\n\d+\s*\n(?:[-+.\deE]+[ \t]+){2}[-+.\deE]+\s*\n", CLOUDCOMPARE),
+    ("PTX", "", PTX_HEAD, CLOUDCOMPARE),
     ("CloudCompare's own", "", rb"CCB2", CLOUDCOMPARE),
     ("VTK", ".vtk .vtp .vtu", rb"# vtk DataFile Version ([\d.]+)", "convert it to .ply, e.g. with ParaView"),
     ("COLMAP's points", "", rb"# 3D point list", "convert it to .ply with `colmap model_converter --output_type PLY`"),

@@ -44,7 +44,9 @@ COLOR = ("r", "g", "b")
 OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
 NUMBERS = "fiu"  # kinds of types that hold real numbers
 UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
-LUMINANCE, CLOSE = np.array([0.299, 0.587, 0.114]), 0.15  # of sRGB (BT.601); of correlations that tell too little
+LUMINANCE = np.array([0.299, 0.587, 0.114])  # of sRGB (BT.601)
+CLOSE = 0.15  # correlations this far apart do not tell which columns are the colours
+SINGLE = 4  # numbers of an array that is one value for all points, or none
 PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
 MOST_LINES, MOST_COLUMNS = 99, 16  # before the numbers, in which names are looked for; of a table without names
@@ -123,7 +125,8 @@ def _unquote(text: str) -> str:
 
 def _words(line: str) -> list[str]:
     """The fields of a line, between the separators that it has."""
-    return [word.strip("' \t") for word in line.split(next((mark for mark in ";,\t" if mark in line), None))]
+    mark = next((mark for mark in ";," if mark in line), None)
+    return [word.strip("' \t") for word in (line.split(mark) if mark or "\t" not in line else re.split(r"\t+", line))]
 
 
 def _is_number(word: str) -> bool:
@@ -178,6 +181,8 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
     for line in reversed(before):
         text = UNITS.sub("", line.lstrip("#/% "))
         names = [name.lower() for name in _words(text)]
+        if "\t" in text and not filled <= len(names) <= count:  # some of the tabs are blanks
+            names = text.lower().split()
         while len(names) > filled and not names[-1]:
             names.pop()
         is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
@@ -213,7 +218,8 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
     whole = (table % 1 == 0).all(axis=0)
     pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # by row and column
-    if first := 2 if pictured else int(timed or np.all(steps == 1)):
+    first = 2 if pictured else int(timed or np.all(steps == 1))
+    if first and count - first != 5:  # x, then y z r g b, is a profile
         report(
             f"columns before x y z, which number or time the points: {first} (if not, name the columns in a first line)"
         )
@@ -362,12 +368,10 @@ def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
         table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
         columns = dict(zip(plain_names(table, report), table.T, strict=True))
-        of_points = {
-            other: x for other, x in arrays.items() if other not in POSITION and np.shape(x)[:1] == (len(table),)
-        }
-        if others := [other for other in arrays if other not in of_points]:
+        others = [other for other, x in arrays.items() if other in POSITION or np.size(x) <= SINGLE < len(table)]
+        if others:
             report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
-        arrays = of_points
+        arrays = {other: x for other, x in arrays.items() if other not in others}
     columns |= name_columns(arrays)
     if len({len(column) for column in columns.values()}) > 1:
         raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")

@@ -106,7 +106,8 @@ def orbit(
     """
     horizontal, east, south = jnp.cos(elevation), jnp.sin(azimuth), jnp.cos(azimuth)
     direction = jnp.stack([horizontal * east, jnp.sin(elevation), horizontal * south])
-    beside = -jnp.sign(elevation) * jnp.stack([east, jnp.zeros_like(east), south])  # up where y is along the view
+    # up where y is along the view
+    beside = -jnp.sign(jnp.sin(elevation)) * jnp.stack([east, jnp.zeros_like(east), south])
     up = jnp.where(jnp.abs(horizontal) > 1e-6, jnp.sign(horizontal) * jnp.array([0.0, 1.0, 0.0]), beside)
     return look_at(centre + distance * direction, centre, up)
 

@@ -47,10 +47,10 @@ def conditional_psnr(
 def ssim(
     image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"]
 ) -> Float[Array, "*batch"]:
-    """Structural similarity, mean over channels; scikit-image's with gaussian weights, sigma 1.5, data range 1,
-    `use_sample_covariance=False`.
+    """Structural similarity, mean over channels; scikit-image's with gaussian weights, sigma 1.5, data range 1.
 
-    Off by up to 1e-3 where both images are bright and flat: a small variance is the difference of large squares.
+    Its `use_sample_covariance` is False.  Off by up to 1e-3 where both images are bright and flat: a small variance is
+    the difference of large squares.
     """
     check_alike("ssim", image, reference)
     if min(image.shape[-3:-1]) < 2 * SSIM_RADIUS + 1:

@@ -36,7 +36,7 @@ from spnr_jax.nn.convolution import BatchNorm, GroupNorm, conv, kernel_init, ups
 def encode_direction(
     directions: Float[Array, "*batch channels"], num_frequencies: int
 ) -> Float[Array, "*batch encoding"]:
-    """[d, sin(d), cos(d), sin(2 d), cos(2 d), ...] of unit directions, 3 + 6 num_frequencies numbers."""
+    """[d, sin(d), cos(d), sin(2 d), cos(2 d), ...] of unit directions or other numbers up to 1."""
     return jnp.concatenate([directions, *waves(directions, num_frequencies)], axis=-1)
 
 

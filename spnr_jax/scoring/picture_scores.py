@@ -9,9 +9,9 @@ Scores come by object, an array (views,) each; NaN is a view without a score and
 no number.  Views of one object are not independent, so objects are drawn, each with all its views, and the interval is
 that of the mean over views.  It is a percentile bootstrap; with few objects these are too narrow, so the levels are
 widened to those that are exact for the mean of normal scores (Hesterberg 2015, "expanded percentile"), and with fewer
-than FEWEST there is none.  Differences are
-taken view by view, so what makes an object hard for both methods cancels; their p-value is that of a sign-flip test
-over objects.  Objects are sorted before anything is drawn: their order does not matter.
+than FEWEST there is none.  Differences are taken view by view, so what makes an object hard for both methods cancels;
+their p-value is that of a sign-flip test over objects.  Objects are sorted before anything is drawn: their order does
+not matter.
 """
 
 import importlib

@@ -102,7 +102,7 @@ def read_lighting(state: State, choice: Any, yaw: Any, exposure: Any) -> Lightin
         raise UserError("a light has a name of the list, and a turn and an exposure that are numbers")
     turn, stops = (float(value) for value in values)
     light = None if choice == SUN_ALONE else choice
-    return dataclasses.replace(state.lighting, light=light, light_yaw=turn, exposure=stops)
+    return dataclasses.replace(state.lighting, light=light, light_yaw=turn if light else 0.0, exposure=stops)
 
 
 def relight(state: State, lighting: Lighting) -> State:

@@ -62,8 +62,8 @@ def write_config(run: Path, config: TrainConfig) -> None:
     write_whole(path, (json.dumps(to_dict(config), indent=2) + "\n").encode())
 
 
-def is_of(run: Path, dataset: Dataset) -> bool:
-    """Whether the run folder has no checkpoint or is one of this data set; it holds this data set's checksum then."""
+def record_data(run: Path, dataset: Dataset) -> bool:
+    """Writes the data set's checksum to the run folder; False if its checkpoints began with another data set."""
     path, described = run / "data.txt", json.dumps([dataset.settings, dataset.splits["train"]]).encode()
     known, checksum = path.read_text() if path.is_file() else None, hashlib.sha256(described).hexdigest()
     if known != checksum:

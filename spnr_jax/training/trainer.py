@@ -63,7 +63,7 @@ def train(
     batches_from = method_of(config.model).prepare(config, dataset, run, light=light)
     with checkpoint.lock_run(run), ExitStack() as stack:
         checkpoint.write_config(run, config)
-        if not checkpoint.is_of(run, dataset):
+        if not checkpoint.record_data(run, dataset):
             tqdm.write(f"{run} began with another data set than {dataset.folder}, and goes on with this one")
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:

@@ -90,6 +90,18 @@ def test_a_vertex_hangs_on_more_than_four_joints(tmp_path):
     assert corners_in_space(part) == {(x, y, 4) for x, y, _ in CORNERS}
 
 
+def test_a_joint_of_another_scene_and_vertices_without_joints_are_at_rest(tmp_path):
+    builder = skinned(armature={"translation": [9, 0, 0]}, translation=[0, 2, 0])
+    builder.document["scenes"][0]["nodes"].pop()
+    (part,) = load_mesh(builder.write(tmp_path / "scene.glb")).parts
+    assert corners_in_space(part) == {tuple(corner) for corner in CORNERS}
+    builder = skinned(armature={"translation": [9, 0, 0], "rotation": [0, 0, 0, 0]}, translation=[0, 2, 0])
+    builder.document["meshes"][0]["primitives"][0]["attributes"].pop("JOINTS_0")
+    asset = load_mesh(builder.write(tmp_path / "bare.glb"))
+    assert corners_in_space(asset.parts[0]) == {(x, y + 2, 0) for x, y, _ in CORNERS}
+    assert "skins of vertices that name no joints" in asset.ignored
+
+
 def test_of_vertices_that_parts_share_each_keeps_its_own(tmp_path):
     builder = GltfBuilder()
     whole = builder.primitive(np.concatenate([CORNERS, CORNERS + [0, 0, 5]]).astype(np.float32))
@@ -160,7 +172,7 @@ REFUSED = (
     (glass(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),
     (glass(extensions=TRANSMISSION), "KHR_materials_transmission"),
     (square(GltfBuilder(extensionsRequired=["ABC_unheard_of"])), "ABC_unheard_of"),
-    (skinned(joints=[[1, 0, 0, 0]] * 4), "joint 1 of 1"),
+    (skinned(joints=[[1, 7, 7, 7]] * 4), "joint 1 of 1"),
     (square(change=lambda d: d["accessors"][0].pop("bufferView")), "accessor 0 is sparse or holds no data"),
     (square(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
     (square(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
@@ -177,7 +189,7 @@ REFUSED = (
     (square(indices=np.array([0, 1, 9], np.uint16)), "vertices 0 to 9 of 4"),
     (square(NORMAL=np.ones((3, 3), np.float32)), "normals of shape (3, 3) where (4, 3) is needed"),
     (square(change=lambda d: d["nodes"][0].update(children=[0])), "not a tree"),
-    (square(change=lambda d: d["bufferViews"][0].update(byteStride=0)), "elements that overlap"),
+    (square(change=lambda d: d["bufferViews"][0].update(byteStride=4)), "elements that overlap"),
 )
 
 

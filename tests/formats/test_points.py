@@ -113,6 +113,9 @@ TEXTS = {
     "a name twice": ("a.csv", "x,y,z,r,g,b,x\n" + table(",", columns=PCV)),
     "ParaView": ("a.csv", '"RGB:0","RGB:1","RGB:2",Points:0,Points:1,Points:2\n' + table(",", columns=PARAVIEW)),
     "names of a map behind a mark": ("a.txt", "#N,E,Elev,R,G,B\n" + table(",", columns=NORTHING)),
+    "tabs that align": ("a.txt", "x\t\ty\tz\t\tr\tg\tb\n" + table("\t")),
+    "tabs and blanks": ("a.txt", "x y z\tr g b\n" + table(" ")),
+    "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
     "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
@@ -181,6 +184,7 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
 
+HALF = [(*row, 255 * (i % 2)) for i, row in enumerate(ROWS)]
 MOVING = np.column_stack([BALL, np.roll(BALL, 1, axis=0) * np.arange(1, 4)])
 
 
@@ -206,6 +210,11 @@ def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
         ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
         ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
+        (
+            "a.csv",
+            "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF),
+            "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
+        ),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
         (
             "a.npz",
@@ -495,6 +504,7 @@ REFUSED = [
     ("a.npz", pack_arrays({"points": np.zeros((5, 2))}), r"numbers of shape \(5, 2\)"),
     ("a.npz", pack_arrays({"points": np.array([["1", "2", "3"]])}), "type <U1"),
     ("a.npz", LENGTHS, "different lengths.*'x': 5.*'y': 4"),
+    ("a.npz", pack_arrays({"points": BALL, "rgb": BALL[1:]}), "different lengths.*'x': 420.*'rgb:0': 419"),
     ("a.npz", pack_arrays({"corners": np.zeros((5, 3))}), "none of the arrays positions, .*; found corners"),
     ("a.npz", archive(as_npy(np.zeros((5, 3))).replace(b"(5, 3), }" + b" " * 6, b"(5000000, 3), }")), "truncated"),
     ("a.npz", archive(as_npy(np.array([{}, None], object), pickled=True)), "Object arrays cannot be loaded"),

@@ -120,7 +120,7 @@ class TestOrbit:
         assert pose[1, 3] - centre[1] == pytest.approx(3 * np.sin(elevation), abs=1e-5)
 
     def test_poses_are_continuous_over_the_poles(self):
-        for azimuth, pole in itertools.product((0.0, 1.0, 4.0), (-np.pi / 2, np.pi / 2)):
+        for azimuth, pole in itertools.product((0.0, 1.0, 4.0), (-np.pi / 2, np.pi / 2, 1.5 * np.pi)):
             poses = [np.asarray(orbit(azimuth, pole + step, 3.0, jnp.zeros(3))) for step in (-2e-3, 0, 2e-3)]
             close(np.diff(poses, axis=0), np.zeros((2, 3, 4)), atol=1e-2)
 

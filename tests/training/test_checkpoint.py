@@ -122,6 +122,6 @@ def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
 def test_a_run_with_a_checkpoint_tells_another_data_set_once(run):
     one = tiny_dataset.dataset()
     other = dataclasses.replace(one, splits=one.splits | {"train": one.splits["train"][1:]})
-    assert [checkpoint.is_of(run, dataset) for dataset in (one, one, other, other)] == [True, True, False, True]
+    assert [checkpoint.record_data(run, dataset) for dataset in (one, one, other, other)] == [True, True, False, True]
     shutil.rmtree(run / "checkpoints")
-    assert checkpoint.is_of(run, one)
+    assert checkpoint.record_data(run, one)

@@ -132,6 +132,7 @@ def test_every_control_reaches_the_options_and_leaves_the_sun(control, value, fi
     assert getattr(asked, field) == expected != getattr(frame.read_lighting(sunny, **QUIET), field)
     assert asked.sun == (1.0, 2.0)
     assert frame.read_lighting(sunny, **QUIET | {"choice": sunny.light_name}).light is None
+    assert frame.read_lighting(sunny, **QUIET | {"choice": sunny.light_name, "yaw": 30}).light_yaw == 0
 
 
 @pytest.mark.parametrize(
