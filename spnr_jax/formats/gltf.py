@@ -199,15 +199,15 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
         file.unpack_mesh(primitive)
         mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
     attributes = primitive["attributes"]
+    wanted = ("POSITION", "NORMAL", "COLOR_0", texcoords, *(name for name in attributes if name.startswith(SKIN)))
     order, used, count = None, None, len(file.accessor(attributes["POSITION"]))
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
         kept, places = np.unique(order, return_inverse=True)
-        whole = all(len(file.accessor(index)) == count for index in attributes.values())
-        if whole and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
+        counts = {file.document["accessors"][index]["count"] for name, index in attributes.items() if name in wanted}
+        if counts == {count} and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
             order, used = places, kept  # the other vertices are those of other primitives
-    names = [name for name in attributes if name.startswith(SKIN)]
-    columns = file.columns(attributes, "POSITION", "NORMAL", "COLOR_0", *names, texcoords, rows=used)
+    columns = file.columns(attributes, *wanted, rows=used)
     order = np.arange(count) if order is None else order
     if mode == "POINTS":
         return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)

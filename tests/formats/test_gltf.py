@@ -106,6 +106,8 @@ def test_of_vertices_that_parts_share_each_keeps_its_own(tmp_path):
     builder = GltfBuilder()
     whole = builder.primitive(np.concatenate([CORNERS, CORNERS + [0, 0, 5]]).astype(np.float32))
     other = whole | {"indices": builder.accessor(SQUARE + np.uint16(4)), "material": builder.material(doubleSided=True)}
+    builder.document["accessors"].append({"sparse": {}})  # of an attribute that nobody reads
+    whole["attributes"]["_FEATURE"] = len(builder.document["accessors"]) - 1
     builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [1, 0, 0, 1]}
     builder.mesh(whole, other)
     parts = load_mesh(builder.write(tmp_path / "shared.glb")).parts
