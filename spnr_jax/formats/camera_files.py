@@ -20,7 +20,8 @@ from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
-SIZE, PIXELS = 512, {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # along each side where a file tells nothing in pixels
+PIXELS = {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # entries that are numbers of pixels
+SIZE = 512  # pixels along each side where a file has none of these
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
 
 

@@ -180,12 +180,10 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     elif "normals" not in values and len(kept) < len(points.positions):
         values["normals"] = outward_normals(points.positions, points.values["base_color"], kept, noise)
     if up == "auto":
-        of_camera = sensor and sensor.up
-        up, reason = (
-            (of_camera, "that of its camera")
-            if of_camera
-            else find_up(positions, kind, of_splats=holds_splats(path, kind))
-        )
+        if sensor and sensor.up:
+            up, reason = sensor.up, "that of its camera"
+        else:
+            up, reason = find_up(positions, kind, of_splats=holds_splats(path, kind))
         how.report(f"{up} taken as up ({reason}); --up says otherwise")
     rotation = np.array(ROTATIONS[up], np.float64)
     if "normals" in values:

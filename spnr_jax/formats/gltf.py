@@ -37,10 +37,10 @@ DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_
 BASIS, WEBP, MOVED = "KHR_texture_basisu", "EXT_texture_webp", "KHR_texture_transform"
 INSTANCES, VISIBILITY, SPLATS = "EXT_mesh_gpu_instancing", "KHR_node_visibility", "KHR_gaussian_splatting"
 READ = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCES, VISIBILITY, SPLATS, "KHR_mesh_quantization"}
-LIGHTS = "KHR_lights_punctual"
+LIGHTS = "KHR_lights_punctual"  # which are dropped, and named
 HARMLESS = {  # a scene looks the same without them
-    *(LIGHTS, "KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata"),
-    *("EXT_mesh_features", "KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
+    *("KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata", "EXT_mesh_features"),
+    *("KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
 }
 MATERIALS = "KHR_materials_"  # of which those that are not modelled are named one by one
 MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}, ("JOINTS_", "WEIGHTS_")
@@ -59,6 +59,7 @@ GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56,
 # Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a
 # mesh again costs as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
+REPEATS = f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)"
 
 
 def load_gltf(path: Path, loading: Loading) -> list[Part]:
@@ -66,15 +67,15 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     file, ignored = GltfFile(path, loading), loading.ignored
     document = file.document
     for extension in document.get("extensionsRequired", []):
-        if extension not in READ | HARMLESS and not extension.startswith(MATERIALS):
+        if extension not in READ | HARMLESS | {LIGHTS} and not extension.startswith(MATERIALS):
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
     drawn = list(list_primitives(file))
     modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, *_ in drawn}
     # points are read where there is nothing else
     wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
     ignored |= {"animations"} & document.keys()
-    unknown = {*document.get("extensionsUsed", [])} - READ - (HARMLESS - {LIGHTS})
-    ignored |= {name for name in unknown if not name.startswith(MATERIALS)}
+    others = {*document.get("extensionsUsed", [])} - READ - HARMLESS
+    ignored |= {name for name in others if not name.startswith(MATERIALS)}
     read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
     parts, repeated = [], 0
@@ -97,13 +98,13 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
         else:
             shapes[key] = _shape(file, primitive, mode, f"TEXCOORD_{placement.texcoord_set}")
         if repeated > MOST_REPEATED:
-            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+            raise UserError(REPEATS)
         columns, faces = shapes[key]
         asks_alpha = number is not None and document["materials"][number].get("alphaMode", "OPAQUE") != "OPAQUE"
-        if joints is not None and all(any(name.startswith(of) for name in columns) for of in SKIN):
-            matrix = _bend(columns, joints)
-        elif joints is not None:
-            ignored.add("skins of vertices that name no joints")
+        if joints is not None:
+            bent = _bend(columns, joints)
+            ignored |= {"skins of vertices that name no joints"} if bent is None else set()
+            matrix = matrix if bent is None else bent
         part = _place(columns, faces, material, placement, matrix)
         if (asks_alpha or mode == "POINTS") and "COLOR_0" in columns and columns["COLOR_0"][:, 3:].min(initial=1) < 1:
             ignored |= {"alpha of vertex colours"} if asks_alpha else set()
@@ -136,27 +137,27 @@ def list_primitives(file: "GltfFile") -> Iterator[tuple[dict, np.ndarray, np.nda
         visible &= node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
         shown += [index] if visible and "mesh" in node else []
         stack += [(child, world[index], visible) for child in reversed(node.get("children", []))]
-    skins, placed = dict[int, np.ndarray](), 0
-    for node in (nodes[index] | {"world": world[index]} for index in shown):
-        joints, instances = None, np.eye(4)[None]
+    joints_of, placed = cache(lambda skin: _joints(file, document["skins"][skin], world)), 0
+    for index in shown:
+        node, joints, moves = nodes[index], None, Columns()
         if "skin" in node:  # then the place of the node itself does not count
-            joints = skins.get(node["skin"])
-            if joints is None:
-                joints = skins[node["skin"]] = _joints(file, document["skins"][node["skin"]], world)
+            joints = joints_of(node["skin"])
         elif INSTANCES in node.get("extensions", {}):
-            instances = _matrices(file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION))
-        if (placed := placed + len(instances)) > MOST_REPEATED / PLACING:
-            raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
-        for matrix in node["world"] @ instances:
+            moves = file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION)
+        if (placed := placed + _count(moves)) > MOST_REPEATED / PLACING:
+            raise UserError(REPEATS)
+        for matrix in world[index] @ _matrices(moves):
             for primitive in document["meshes"][node["mesh"]]["primitives"]:
                 yield primitive, matrix, joints
 
 
+def _count(moves: Columns) -> int:
+    return max(map(len, moves.values()), default=1)
+
+
 def _matrices(moves: Columns) -> np.ndarray:
-    """The matrices (n, 4, 4) of scales, then rotations (x, y, z, w), then translations, as far as there are any."""
-    count = max(map(len, moves.values()), default=1)
-    if count > MOST_REPEATED / PLACING:
-        raise UserError(f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)")
+    """The matrices (n, 4, 4) of scales, then rotations (x, y, z, w), then translations; of no moves, one identity."""
+    count = _count(moves)
     if any(len(move) != count for move in moves.values()):
         raise UserError("has instances with several numbers of places, turns or sizes: broken file")
     translation, rotation, scale = (moves.get(name, np.tile(plain, (count, 1))) for name, plain in MOTION.items())
@@ -179,9 +180,11 @@ def _joints(file: "GltfFile", skin: dict, world: dict[int, np.ndarray]) -> np.nd
     return np.where(np.array(elsewhere)[:, None, None], np.eye(4), joints)
 
 
-def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray:
-    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four or more each."""
+def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray | None:
+    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four or more each; None if they name none."""
     parts = [[columns[name] for name in sorted(columns) if name.startswith(of)] for of in SKIN]
+    if not all(parts):
+        return None
     numbers, weights = np.concatenate(parts[0], axis=1), np.concatenate(parts[1], axis=1).astype(np.float64)
     if numbers.shape != weights.shape:
         raise UserError("has a skin with other numbers of joints than of weights: broken file")
@@ -200,7 +203,8 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
         mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
     attributes = primitive["attributes"]
     wanted = ("POSITION", "NORMAL", "COLOR_0", texcoords, *(name for name in attributes if name.startswith(SKIN)))
-    order, used, count = None, None, len(file.accessor(attributes["POSITION"]))
+    count = len(file.accessor(attributes["POSITION"]))
+    order, used = np.arange(count), None
     if "indices" in primitive:
         order = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
         kept, places = np.unique(order, return_inverse=True)
@@ -208,7 +212,6 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
         if counts == {count} and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
             order, used = places, kept  # the other vertices are those of other primitives
     columns = file.columns(attributes, *wanted, rows=used)
-    order = np.arange(count) if order is None else order
     if mode == "POINTS":
         return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_STRIP":

@@ -8,7 +8,9 @@ three corners, as ShapeNet has for the two sides, one is kept, that of the mater
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +24,10 @@ from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
 
 Rests = dict[str, list]
+Move = tuple[tuple[float, float], tuple[float, float]]  # scale and offset of texture coordinates
+Look = tuple[Material | None, Move]  # a principled material, None where it is nowhere to be seen
+UNMOVED: Move = (1.0, 1.0), (0.0, 0.0)
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
-UNMOVED = np.array([[1.0, 1.0], [0.0, 0.0]])  # scale and offset of texture coordinates
 NEARLY_GREY = 16  # of 255: between the channels of a grey JPEG
 READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
@@ -52,17 +56,16 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     library: dict[str, dict[str, str]] = {}
     for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+(?!#)", names.strip())):
         library |= parse_mtl(loading.read(name.partition(" #")[0]) or b"")
-    looks: dict[str, Material | None] = {}
-    moves: dict[str, np.ndarray] = {}
+    looks: dict[str, Look] = {}
     for name in dict.fromkeys(text["usemtl"]):
-        looks[name] = make_material() if not name else _look(name, library.get(name), loading, moves)
-        look = looks[name]
+        look, move = _look(name, library.get(name), loading) if name else (make_material(), UNMOVED)
         if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
-            looks[name] = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
+            look = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
         elif colors is not None and look is not None:
             loading.say("colours of the vertices multiply those of the material", about=repr(name))
-    parts = _parts(text, stack_columns(columns), colors, looks, moves, loading)
+        looks[name] = look, move
+    parts = _parts(text, stack_columns(columns), colors, looks, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
     if text["l"]:
@@ -102,18 +105,19 @@ def _table(rows: list[str], width: int | None) -> np.ndarray:
 
 def _columns(text: Rests, loading: Loading) -> Columns:
     """The columns of the vertices: positions, and perhaps colours, white where only some have one (as of Blender)."""
-    rows, lengths = text["v"], [len(row.partition("#")[0].split()) for row in text["v"]]
-    if {*lengths} == {3, 6}:
-        loading.say(f"{lengths.count(3):,} of {len(rows):,} vertices have no colour: white taken")
-        rows = [row.partition("#")[0] + " nan nan nan" * (n == 3) for row, n in zip(rows, lengths, strict=True)]
     try:
-        table = _table(rows, None)
+        table = _table(text["v"], None)
     except ValueError as error:
         if "number of columns" not in str(error):
             raise
-        raise UserError("has vertices of different lengths: it is broken, or give colours to all of them") from None
-    if {*lengths} == {3, 6}:
-        bare = np.array(lengths) == 3
+        rows = [row.partition("#")[0] for row in text["v"]]
+        lengths = np.array([len(row.split()) for row in rows])
+        if {*lengths} != {3, 6}:
+            message = "has vertices of different lengths: it is broken, or give colours to all of them"
+            raise UserError(message) from None
+        bare = lengths == 3
+        loading.say(f"{bare.sum():,} of {len(rows):,} vertices have no colour: white taken")
+        table = _table([row + " nan nan nan" * int(none) for row, none in zip(rows, bare, strict=True)], None)
         table[bare, 3:] = full_scale(table.dtype, float(table[~bare, 3:].max()))
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
@@ -121,12 +125,7 @@ def _columns(text: Rests, loading: Loading) -> Columns:
 
 
 def _parts(
-    text: Rests,
-    positions: np.ndarray,
-    colors: np.ndarray | None,
-    looks: dict[str, Material | None],
-    moves: dict[str, np.ndarray],
-    loading: Loading,
+    text: Rests, positions: np.ndarray, colors: np.ndarray | None, looks: dict[str, Look], loading: Loading
 ) -> list[Part]:
     """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
     numbers = {word: i for i, word in enumerate(dict.fromkeys(text["f"]))}
@@ -144,22 +143,24 @@ def _parts(
     number = {name: i for i, name in enumerate(looks)}
     has = (corners[faces] > 0).all(axis=1)  # whether each face has places, texture coordinates, normals
     kind = 4 * np.array([number[name] for name in text["usemtl"]])[owner] + 2 * has[:, 1] + has[:, 2]
-    shown = np.array([look is not None for look in looks.values()])
+    shown = np.array([look is not None for look, _ in looks.values()])
     order = np.argsort(kind, kind="stable")
     order = order[shown[kind[order] // 4]]
     first = _first_of_doubles(positions[faces[order]])
     if not first.all():
         loading.ignored.add(f"{int((~first).sum())} doubled faces (one of each is kept)")
+
+    @cache
+    def moved(move: Move) -> np.ndarray:
+        return (texcoords * move[0] + move[1]) * [1, -1] + [0, 1]  # v is from the lower edge
+
     parts, faces, kind = [], faces[order[first]], kind[order[first]]
     for code in np.unique(kind):
-        name, material = list(looks.items())[code // 4]
+        material, move = list(looks.values())[code // 4]
         assert material is not None
         part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
-        if code & 2:
-            scale, offset = moves.get(name, UNMOVED)
-            there = texcoords if (moves.get(name, UNMOVED) == UNMOVED).all() else texcoords * scale + offset
-            part = replace(part, texcoords=there * [1, -1] + [0, 1])  # v is from the lower edge
-        parts.append(replace(part, normals=normals) if code & 1 else part)
+        placed = moved(move) if code & 2 else None
+        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=placed))
     return parts
 
 
@@ -196,18 +197,16 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     return library
 
 
-def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict[str, np.ndarray]) -> Material | None:
-    """The principled material of an MTL entry; None where it is nowhere to be seen.
-
-    `moves` gets the scale and offset of its texture coordinates, those of its first map (2, 2).
-    """
+def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
+    """The look of an MTL entry; its texture coordinates are moved as those of its first map."""
     ignored = loading.ignored
     if entry is None:
         loading.go_on_without("uses a material that no library defines", repr(name))
-        return make_material()
+        return make_material(), UNMOVED
     if loading.strict:  # that it is transparent is a plainer reason than a missing file
         loading.cut_out(name, make_material(), *_alpha(entry, None))
     maps: dict[str, np.ndarray] = {}
+    move = UNMOVED
     wrap: assets.Wrap = "repeat"
     for key in MAPS:
         statement, options, place = entry.get(key, ""), {}, 0
@@ -216,12 +215,10 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict
         ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
         file = statement[place:].strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
-            own = UNMOVED.copy()
-            for row, letter in enumerate("so"):
-                numbers = [float(x) for x in options.get(letter, ()) if not x.isalpha()][:2]
-                own[row, : len(numbers)] = numbers
-            if (moves.setdefault(name, own) != own).any():
+            own = _pair(options.get("s", ()), 1.0), _pair(options.get("o", ()), 0.0)
+            if maps and own != move:
                 ignored.add("second texture with its own coordinates")
+            move = move if maps else own
             maps[key] = texels
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
@@ -244,7 +241,13 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading, moves: dict
         for key, plain in (("pr", shiny), ("pm", 0))
     )
     material = make_material(color, roughness, metallic, wrap)
-    return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d")))
+    return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d"))), move
+
+
+def _pair(words: Sequence[str], plain: float) -> tuple[float, float]:
+    """The first two numbers of a map's option; plain ones where it has fewer."""
+    one, two, *_ = (*(float(word) for word in words if not word.isalpha()), plain, plain)
+    return one, two
 
 
 def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> tuple[str, np.ndarray, float | int | None]:

@@ -55,7 +55,8 @@ def find_up(positions: np.ndarray, kind: str, *, of_splats: bool = False) -> tup
     positions = positions[:: -(-len(positions) // MOST_STANDING)]
     normals = estimate_normals(positions, cKDTree(positions))
     scores = {axis: standing(positions, normals, "xyz".index(axis)) for axis in "yz"}
-    up, reason = "z" if scores["z"] > scores["y"] + MARGIN else "y", f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"
+    up = "z" if scores["z"] > scores["y"] + MARGIN else "y"
+    reason = f"y stands {scores['y']:.2f}, z {scores['z']:.2f}"
     return ("-y", f"{reason}; splats have y down") if of_splats and up == "y" else (up, reason)
 
 

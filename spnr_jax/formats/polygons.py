@@ -9,7 +9,6 @@
 
 import io
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +80,8 @@ def _textured(
     parts = []
     for i, image in enumerate(images):
         material = make_material(decode_texels(image[..., :3], SRGB_TABLE))
-        part = Part(positions=positions, faces=faces[number == i], material=material, texcoords=texcoords)
-        parts.append(replace(part, normals=normals))
+        own = faces[number == i]
+        parts.append(Part(positions=positions, faces=own, material=material, normals=normals, texcoords=texcoords))
     return parts
 
 
