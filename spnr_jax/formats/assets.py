@@ -1,17 +1,17 @@
-"""What every source of objects hands on: parts of triangles with principled materials.
+"""Objects in memory: parts of triangles with principled materials; and what mesh readers share.
 
-Conventions, fixed here and nowhere else:
-  axes        right-handed, y up (as in glTF), any unit; `normalise` brings an object into the unit sphere
+Conventions:
+  axes        right-handed, y up (as in glTF), any unit; `normalise` maps an object into the unit sphere
   colours     linear RGB in [0, 1]
-  textures    rows of texels; texture coordinate (u, v) = (0, 0) is the outer corner of texel [0, 0], v runs down the
-              rows (as in glTF; mitsuba's `bitmap` reads the same way); at most MAX_SIZE a side, box-filtered to that
-  faces       counted through all parts of an object in order: global face = faces of the parts before + local face
+  textures    rows of texels; texture coordinate (u, v) = (0, 0) is the outer corner of texel [0, 0], v increases down
+              the rows (as in glTF and in mitsuba's `bitmap`); box-filtered to at most MAX_SIZE a side
+  faces       numbered through all parts of an object in order: global face = faces of the parts before + local face
 
-Parts that light passes through, and files that are named and missing, are reasons to reject an object where references
-are made (`refuse`).  For a picture, a missing image leaves plain values, and of what is not opaque everywhere
-  MASK                  is surface where alpha reaches the cut-off of the file
-  BLEND, transmission   opaque: is drawn, but for texels that are all but invisible beside the most visible one
-                        skip: is surface where alpha is at least a half; a part that transmits light is left out
+For reference images ("refuse"), transparent parts and missing files are errors.  For a picture, a missing image is
+replaced by plain values, and transparency becomes surface or nothing:
+  MASK                  surface where alpha reaches the file's cut-off
+  BLEND, transmission   "opaque": surface, except for texels that are nearly invisible beside the most visible one
+                        "skip": surface where alpha is at least 0.5; transmissive parts are left out
 """
 
 import base64
@@ -33,14 +33,14 @@ from spnr_jax.formats.columns import LONGEST_NAME
 from spnr_jax.kernels.imaging import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
-MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # as SciPy calls them
-Values = np.ndarray | np.floating  # NumPy makes numbers of arrays without axes
+MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}  # SciPy's names
+Values = np.ndarray | np.floating  # NumPy returns scalars for arrays without axes
 ShownParts = Literal["opaque", "skip"]
-TransparentParts = Literal["refuse", ShownParts]  # what becomes of parts that light passes through
-CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0, "opacity": 0, "normal_map": 1}  # axes of one value
-BARELY_VISIBLE = 0.1  # alpha below it, as a share of the texture's largest, is empty space around what is drawn
+TransparentParts = Literal["refuse", ShownParts]
+CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0, "opacity": 0, "normal_map": 1}  # axes of a single value
+BARELY_VISIBLE = 0.1  # alpha, as a share of the texture's maximum, below which a texel is empty
 MOSTLY_OPAQUE = 0.5
-MOST_NAMES = 3  # in a sentence
+MOST_NAMES = 3  # in a message
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
@@ -48,7 +48,7 @@ SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 
 
 def extra(package: str, name: str = "meshes") -> Any:
-    """A package of an extra; UserError where it is not installed."""
+    """Imports a package of an extra; UserError if it is not installed."""
     try:
         return importlib.import_module(package)
     except ImportError:
@@ -60,9 +60,8 @@ class Material:
     """A principled (metallic-roughness) material; each channel is one value or a texture of its own size.
 
     base_color: (3,) or (height, width, 3); roughness, metallic: () or (height, width). All float32 in [0, 1], linear.
-    opacity (height, width) or None: there is surface where it is at least `cutoff`.
-    normal_map (height, width, 3) or None: normals along the directions in which u grows, in which v falls, and
-    outwards, of any length.
+    opacity (height, width) or None: surface where it is at least `cutoff`.
+    normal_map (height, width, 3) or None: tangent-space normals; axes: increasing u, decreasing v, outwards.
     """
 
     base_color: np.ndarray
@@ -78,7 +77,7 @@ class Material:
 class Part:
     """Triangles that share one material.
 
-    positions (v, 3) float64; faces (f, 3) int64, counter-clockwise seen from outside where the source knows;
+    positions (v, 3) float64; faces (f, 3) int64, counter-clockwise from outside if the source is consistent;
     normals (v, 3) unit, or None for flat shading; texcoords (v, 2), needed only if the material has a texture;
     colors (v, 3) linear, multiplies the material's base colour, or None; alpha (v,) of any range, or None.
     """
@@ -94,9 +93,10 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Asset:
-    """One object: its parts, without faces if it is a file of points, and what its source holds that is not modelled.
+    """One object: its parts, which have no faces if the file holds points.
 
-    `notes` are sentences about what was made of transparent parts and of files that are missing.
+    `ignored`: names of features of the file that are not modelled.  `notes`: sentences about transparent parts, missing
+    files and other decisions.
     """
 
     parts: tuple[Part, ...] = ()
@@ -120,24 +120,24 @@ def make_material(base_color: Any = 0.5, roughness: Any = 0.5, metallic: Any = 0
 
 
 class Loading:
-    """One reading of a mesh file: where its companions lie, what may be missing, and what became of it.
+    """The state of reading one mesh file: where its companion files are, what may be missing, and notes.
 
-    `folder` is the mesh's; `root` is the object's, that one or one above it: a ShapeNet object keeps its images beside
-    the folder of its mesh (`../images`).  `ignored` names what the file holds that is not modelled.
+    `folder` is the mesh's; `root` is the object's, the same or one above it: ShapeNet keeps images beside the folder of
+    the mesh (`../images`).  `ignored` collects features of the file that are not modelled.
     """
 
     def __init__(self, folder: Path, root: Path | None = None, transparent_parts: TransparentParts = "refuse"):
         self.folder, self.root, self.transparent_parts = folder, root or folder, transparent_parts
-        self.strict = transparent_parts == "refuse"  # the object is wanted as it is, or not at all
+        self.strict = transparent_parts == "refuse"  # nothing may be missing or replaced
         self.ignored: set[str] = set()
-        self._said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in their order
+        self._said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in order
 
     def read(self, uri: str, needed: bool = False) -> bytes | None:
-        """Bytes of the file that `uri` names (percent escapes as in glTF), or of a data URI; None where it is missing.
+        """Bytes of the file at `uri` (percent escapes as in glTF), or of a data URI; None if it is missing.
 
-        A name means the file at its longest end, in any letter case, that is in the mesh's folder or in one above it up
-        to the object's: nothing outside or on the network is read, and a path of another machine still finds what lies
-        beside the mesh.  UserError for a missing file that is `needed`, as all are where the reading is strict.
+        Looks in the mesh's folder, then in those above it up to `root`, for the longest suffix of the path that exists,
+        ignoring letter case.  So absolute paths of another machine still work, and nothing outside `root` is read.
+        UserError for a missing file if it is `needed` or the reading is strict.
         """
         if uri.startswith("data:"):
             head, _, payload = uri.partition(",")
@@ -155,12 +155,12 @@ class Loading:
         return None
 
     def read_image(self, uri: str) -> np.ndarray | None:
-        """Texels (h, w, 4) of the image that `uri` names; None where it is missing or cannot be read."""
+        """Texels (h, w, 4) of the image at `uri`; None if it is missing or cannot be read."""
         data = self.read(uri)
         return None if data is None else self.decode_image(data, uri[:80])
 
     def decode_image(self, data: bytes, name: str) -> np.ndarray | None:
-        """Texels (h, w, 4) of the bytes of an image; None where they cannot be read."""
+        """Texels (h, w, 4) of the bytes of an image; None if they cannot be read."""
         try:
             return read_image(data, name)
         except UserError as error:
@@ -169,12 +169,12 @@ class Loading:
         return None
 
     def say(self, *sentences: str, about: str = "") -> None:
-        """Keeps sentences for the notes, or a name for one that begins so."""
+        """Adds sentences to the notes, or a name to the sentence that begins so."""
         for sentence in sentences:
             self._said.setdefault(sentence, {}).update({about: None} if about else {})
 
     def notes(self) -> tuple[str, ...]:
-        """A sentence for each thing that was decided."""
+        """The notes, one sentence each."""
         notes = []
         for beginning, names in self._said.items():
             more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
@@ -182,7 +182,7 @@ class Loading:
         return tuple(notes)
 
     def go_on_without(self, reason: str, name: str, needed: bool = False) -> None:
-        """Keeps for the notes why plain values are taken; UserError where everything has to be there."""
+        """Notes that plain values replace something missing; UserError if it is needed or the reading is strict."""
         if needed or self.strict:
             raise UserError(f"{reason}: {name}")
         self.say(f"plain values taken where it {reason}", about=name[:200])
@@ -190,9 +190,10 @@ class Loading:
     def cut_out(
         self, name: str, material: Material, why: str, alpha: np.ndarray, cutoff: float | int | None = None
     ) -> Material | None:
-        """The material with surface where its alpha () or (h, w) says so, None if that is nowhere.
+        """The material with surface only where its alpha () or (h, w) says so; None if there is none.
 
-        `why` its file says that it is transparent, if it does: UserError where it may not be; `cutoff` of a mask.
+        `why`: the statement of the file that makes it transparent, or "".  `cutoff`: that of a mask.  UserError for
+        transparency if the reading is strict.
         """
         if why and self.strict:
             raise UserError(f"is transparent: material {name!r} has {why}")
@@ -217,7 +218,7 @@ class Loading:
 
 
 def _find(folder: Path, names: list[str]) -> Path | None:
-    """The file at names, in any letter case, below a folder; the very names are preferred."""
+    """The file at this path below a folder, ignoring letter case; exact names are preferred."""
     for name in names:
         if name == ".." or ":" in name or not folder.is_dir():
             return None
@@ -231,15 +232,15 @@ def _find(folder: Path, names: list[str]) -> Path | None:
 
 
 def read_image(data: bytes, name: str) -> np.ndarray:
-    """The texels of `decode_image`; ValueError, which names it, for an image that cannot be read."""
+    """Texels as of `decode_image`; ValueError, which names the image, if it cannot be read."""
     with refusing(f"names an image that cannot be read: {name}"):
         return decode_image(data)
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """Texels (height, width, 4) uint8 of an image file as they are encoded; alpha is 255 where it has none.
+    """Encoded texels (height, width, 4) uint8 of an image file; alpha is 255 if it has none.
 
-    ValueError for none, and for too large a one; what is damaged raises whatever Pillow raises.
+    ValueError if it is no image or too large; Pillow's exceptions if it is damaged.
     """
     if data.startswith(b"\xabKTX 20\xbb\r\n\x1a\n"):
         raise ValueError("KTX2, which is not read: convert it to PNG, e.g. with `ktx extract`")
@@ -248,19 +249,19 @@ def decode_image(data: bytes) -> np.ndarray:
             image: Image.Image = Image.open(io.BytesIO(data))
     except UnidentifiedImageError:
         raise ValueError("is not an image") from None
-    if image.width * image.height > MOST_PIXELS:  # before memory is taken for them
+    if image.width * image.height > MOST_PIXELS:  # before allocating them
         raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-    if image.mode.startswith("I"):  # PIL would clip 16-bit grey to 255 instead of scaling it
+    if image.mode.startswith("I"):  # Pillow clips 16-bit grey to 255 instead of scaling it
         image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
     return np.asarray(image.convert("RGBA"))
 
 
 def decode_texels(encoded: np.ndarray, table: np.ndarray = LEVELS) -> np.ndarray:
-    """Values float32 by a table (256,) of texels (h, w) or (h, w, c) uint8, box-filtered to at most MAX_SIZE a side."""
+    """Values float32 of texels (h, w) or (h, w, c) uint8 by a table (256,), box-filtered to at most MAX_SIZE a side."""
     height, width, *channels = encoded.shape
     ratio = min(1, MAX_SIZE / max(height, width))
     size = max(1, round(height * ratio)), max(1, round(width * ratio))
-    flat = encoded.reshape(height, width, -1)  # one channel after the other: memory
+    flat = encoded.reshape(height, width, -1)  # channel by channel, to save memory
     values = [resize(table[flat[..., channel]], *size) for channel in range(flat.shape[-1])]
     return np.stack(values, axis=-1).reshape(*size, *channels)
 
@@ -276,7 +277,7 @@ def resize(texels: np.ndarray, height: int, width: int) -> np.ndarray:
 def lookup(texels: np.ndarray, texcoords: np.ndarray, wrap: Wrap) -> np.ndarray:
     """Bilinear values (n,) or (n, c) of a texture (height, width) or (height, width, c) at texcoords (n, 2).
 
-    Texel centres lie at half-integers / size.  Mitsuba's `bitmap` gives the same, which a test compares.
+    Texel centres lie at half-integers / size, as in mitsuba's `bitmap`.
     """
     height, width, *channels = texels.shape
     places = (np.asarray(texcoords, np.float64) * [width, height] - 0.5)[:, ::-1].T

@@ -1,9 +1,9 @@
-"""Cameras of files in the convention of NeRF and nerfstudio (transforms.json).
+"""Camera files in the convention of NeRF and nerfstudio (transforms.json).
 
-`frames` hold a `transform_matrix` each: camera to world, OpenGL axes (x right, y up, looking along -z).  Intrinsics are
-those of the frame or of the whole file: `w` and `h` in pixels, `fl_x` or `camera_angle_x`, and optionally `fl_y`, `cx`
-and `cy`.  With `camera_angle_x` alone, as of the original NeRF, pictures are square.  Cameras are pinholes: lens
-distortion is not drawn.
+Each entry of `frames` has a `transform_matrix`: camera to world, OpenGL axes (x right, y up, looking along -z).
+Intrinsics belong to a frame or to the whole file: `w` and `h` in pixels, `fl_x` or `camera_angle_x`, and optionally
+`fl_y`, `cx` and `cy`.  With `camera_angle_x` alone, as in the original NeRF's files, pictures are square.  Cameras are
+pinholes: lens distortion is ignored.
 """
 
 import json
@@ -20,8 +20,8 @@ from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
-PIXELS = {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # entries that are numbers of pixels
-SIZE = 512  # pixels along each side where a file has none of these
+PIXELS = {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # entries in pixels
+SIZE = 512  # width and height if a file has none of these
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
 
 
@@ -33,16 +33,16 @@ def read_cameras(
     size: int = SIZE,
     report: Callable[[str], None] = lambda line: None,
 ) -> list[Camera]:
-    """The cameras of a file, in its frame or, if given, in that of rotation @ (position - origin).
+    """The cameras of a file, in its frame or, if given, in the frame of rotation @ (position - origin).
 
-    `size`: pixels along each side where the file has neither `w` nor `h`.  `report` gets a line if lens distortion is
-    left out.  ValueError, one line that names the file, if it has none.
+    `size`: width and height in pixels if the file has neither `w` nor `h`.  `report` gets a line if lens distortion is
+    ignored.  ValueError, one line that names the file, if it has no valid cameras.
     """
     return cameras_of(read_document(path, report), rotation, origin, size)
 
 
 def read_document(path: str | Path, report: Callable[[str], None] = lambda line: None) -> Mapping[str, Any]:
-    """The content of a file of cameras, with `read_cameras`' report and errors: `cameras_of` takes it."""
+    """The checked content of a camera file, for `cameras_of`; report and errors as of `read_cameras`."""
     try:
         document = json.loads(Path(path).read_bytes())
         cameras_of(document)
@@ -76,9 +76,9 @@ def cameras_of(
     return [_camera(of, number, turn, place) for number, of in enumerate(sized)]
 
 
-@np.errstate(all="ignore")  # of numbers that leave float32, which are infinite then, and refused
+@np.errstate(all="ignore")  # overflow in float32 gives infinity, which is refused
 def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origin: np.ndarray) -> Camera:
-    """One camera; in double precision until the origin is subtracted."""
+    """One camera; in float64 until the origin is subtracted."""
     if entries.get("camera_model") in FISHEYE:
         raise UserError(f"camera_model {entries['camera_model']}, where pinhole cameras are drawn")
     width, height = (int(entries[name]) for name in "wh")
@@ -104,7 +104,7 @@ def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origi
 
 
 def describe_cameras(cameras: Sequence[Camera], names: Sequence[str], rotation: np.ndarray, origin: np.ndarray) -> dict:
-    """The content of a file that `read_cameras` reads, with this rotation and origin, as these cameras."""
+    """The content of a camera file: `read_cameras` with this rotation and origin gives these cameras back."""
     intrinsics = [_intrinsics(camera) for camera in cameras]
     common = {name: x for name, x in intrinsics[0].items() if all(other[name] == x for other in intrinsics)}
     frames = []

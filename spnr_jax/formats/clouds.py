@@ -1,14 +1,14 @@
-"""Point clouds from files: one path, for points and for meshes.
+"""Point clouds from files of points and of meshes, on one path.
 
-    open        raw columns by the names that the file gives, positions in float64 (point_files.py, meshes.py)
+    open        columns with the file's names, positions in float64 (point_files.py, meshes.py)
     interpret   colours, materials, normals, opacity, classes (columns.py, orientation.py)
-    cut         a box, without the dominant plane, one cluster
-    merge       equal and nearly equal points; what then is no surface is refused
-    clean, thin outliers and noise; evenly spread points
-    origin      subtracted where float32 is too coarse, then float32
+    cut         to a box; remove the dominant plane; keep one cluster
+    merge       equal and nearly equal points; refuse what is no surface then
+    clean, thin remove outliers and noise; keep evenly spread points
+    origin      subtract it where float32 is too coarse; then convert to float32
 
-`read_cloud` makes a PointCloud of NumPy float32 arrays, not padded, in the file's own units, turned so that y is up;
-`place_cloud` also says how to get back into the file's frame.  Files of points are of any size, in bounded memory.
+`read_cloud` returns a PointCloud of NumPy float32 arrays, not padded, in the file's units, rotated so that y is up.
+`place_cloud` also returns the transform back to the file's frame.  Point files may be larger than the memory.
 """
 
 from collections.abc import Iterable, Iterator
@@ -47,31 +47,31 @@ from spnr_jax.surfels.normals import estimate_normals, face_sensor, outward_norm
 
 __all__ = ("MESHES", "PlacedCloud", "cloud_of_ply", "place_cloud", "read_cloud")
 
-MESH_POINTS = 4096  # points drawn from a mesh if no number is asked for; the most that training draws
-MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more lie close enough as they are drawn
-CAPACITY = 2**19  # points of a file that are in memory at most; of more a random sample is kept while reading
+MESH_POINTS = 4096  # points sampled on a mesh by default: the most that training samples
+MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more are drawn at random
+CAPACITY = 2**19  # points in memory; a random sample of larger files is kept while reading
 BROKEN = "NaN, infinity or too large a number"
-TEXT_MESHES = (".obj", ".off")  # which write numbers of any length
-CUT_MESH = 2**18  # points drawn from a mesh that something is cut out of
+TEXT_MESHES = (".obj", ".off")  # numbers with any number of digits
+CUT_MESH = 2**18  # points sampled on a mesh before a part of it is cut out
 WHOLE = Cut()
-COARSEST_STEP = 2e-5  # of the extent, that rounding to float32 may cost
-LOST_STEP = 1e-3  # of the extent of an axis, from which on it is said that the file rounded it
-MOST_LOST = 5e-3  # of the extent, from which on what is left is no shape any more
-ROUNDED = 0.02  # of the extent, that lies between values of an axis which may have been rounded
-SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis, at which six digits leave a hundred values at most
-NO_DATA = (-9999, -32767, -32768)  # heights of a grid's places without one
-SAMPLE = 512  # points at which the file's normals are compared with the points
-FEWEST = 10  # points that tell something of a surface
-LEAST_POINTS = 100  # that tell normals, and what has no colour
-AGREEING = 0.6  # median cosine between normals and the points' planes, below which normals are not believed
-PARALLEL = 0.9  # cosine of what is a constant normal, and share of the surface that it must fit
-DEGREES, NEEDLE = 0.5, 100.0  # widest place in degrees; height over the width from which on degrees are suspected
-THIN = 0.1, 1.0  # spacings between which a plate is thick whose sides cannot be told apart
+COARSEST_STEP = 2e-5  # of the extent: largest error of rounding to float32
+LOST_STEP = 1e-3  # of the extent of an axis: the file's rounding is reported above it
+MOST_LOST = 5e-3  # of the extent: above it rounding has destroyed the shape
+ROUNDED = 0.02  # of the extent: distance between values of an axis above which it may have been rounded
+SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis: six digits leave at most a hundred values there
+NO_DATA = (-9999, -32767, -32768)  # heights that mean "unknown" in grids
+SAMPLE = 512  # points at which the file's normals are checked against the points
+FEWEST = 10  # points from which a surface can be estimated
+LEAST_POINTS = 100  # from which normals and missing colours can be checked
+AGREEING = 0.6  # median cosine between given and estimated normals, below which the given ones are ignored
+PARALLEL = 0.9  # cosine to a constant normal, and the share of the points that must have it
+DEGREES, NEEDLE = 0.5, 100.0  # largest width in degrees; ratio of height to width above which degrees are suspected
+THIN = 0.1, 1.0  # thickness, in spacings, of a plate whose two sides cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedCloud:
-    """A cloud, y up, and its place in the file's frame: position in the file = rotation.T @ position + origin."""
+    """A cloud, y up, and its transform to the file's frame: position in the file = rotation.T @ position + origin."""
 
     cloud: PointCloud
     up: str
@@ -81,18 +81,18 @@ class PlacedCloud:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How a file is read; ValueError for an option that there is not."""
+    """Options of reading a file; ValueError for unknown values."""
 
-    num_points: int | None = None  # more points are thinned out evenly, fewer are kept; a mesh gives as many, or 4096
+    num_points: int | None = None  # larger clouds are thinned evenly; samples on a mesh (default 4096)
     up: str = "auto"  # the file's upward axis
     seed: int = 0
-    clean: Clean = "off"  # how points, never those of meshes, are cleaned before they are thinned (kernels/cleaning.py)
-    cut: Cut = WHOLE  # which part of a scene is wanted
-    transparent_parts: ShownParts = "opaque"  # of a mesh; or left out ("skip")
-    report: Report = lambda line: None  # gets a line about every assumption
+    clean: Clean = "off"  # how point files, not meshes, are cleaned before thinning (kernels/cleaning.py)
+    cut: Cut = WHOLE  # the part of the scene to keep
+    transparent_parts: ShownParts = "opaque"  # of a mesh, or "skip" to leave them out
+    report: Report = lambda line: None  # called with a line about every assumption
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
+        """ValueError names the invalid option."""
         choices = {"up": (*ROTATIONS, "auto"), "transparent_parts": get_args(ShownParts), "clean": get_args(Clean)}
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
@@ -113,21 +113,21 @@ def read_cloud(
     transparent_parts: ShownParts = "opaque",
     report: Report = lambda line: None,
 ) -> PointCloud:
-    """The cloud in a file of points or on a mesh file's surface: (points, ...) float32, `mask` all True.
+    """The cloud of a point file, or sampled on the surface of a mesh file: (points, ...) float32, `mask` all True.
 
-    The options are those of `Reading`.  Points that are thinned out have normals, the file's or those that all of its
-    points tell (surfels/normals.py).  ValueError, one line that names the file, for whatever cannot be read.
+    The options are those of `Reading`.  A thinned cloud has normals: the file's, or estimated from all of its points
+    (surfels/normals.py).  ValueError, one line that names the file, if it cannot be read.
     """
     how = {"seed": seed, "clean": clean, "cut": cut, "transparent_parts": transparent_parts, "report": report}
     return place_cloud(path, num_points=num_points, up=up, **how).cloud
 
 
 def place_cloud(path: str | Path, **options: Any) -> PlacedCloud:
-    """The cloud of `read_cloud` with the way back into the file's frame."""
+    """The cloud of `read_cloud` with its transform to the file's frame."""
     path, how = Path(path), Reading(**options)
     kind = kind_of(path)
     try:
-        with np.errstate(all="ignore"):  # of signalling NaN, and what leaves its type: both are looked for
+        with np.errstate(all="ignore"):  # signalling NaN and overflow: both are checked for
             points, noise = _points_of(path, kind, how)
             return _place(path, kind, points, noise, how)
     except (ValueError, OSError) as error:
@@ -135,7 +135,7 @@ def place_cloud(path: str | Path, **options: Any) -> PlacedCloud:
 
 
 class Points(NamedTuple):
-    """Positions (points, 3) float64 as they lie in the file less `origin`, and the other columns by name."""
+    """Positions (points, 3) float64 in the file's axes minus `origin`, and the other columns by name."""
 
     positions: np.ndarray
     values: dict[str, np.ndarray]
@@ -147,7 +147,7 @@ class Points(NamedTuple):
 
 
 def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
-    """The points of a file, read, cut out and cleaned, and how noisy they were."""
+    """The points of a file, read, cut and cleaned, and their noise level."""
     pieces, sampled, noise, cut = column_pieces(path, kind, how.report), False, 0.0, how.cut
     if pieces is None:
         columns, sampled = _mesh_columns(path, kind, how)
@@ -166,7 +166,7 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
 
 
 def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) -> PlacedCloud:
-    """The cloud of the points, thinned, with normals, upright, moved to its origin."""
+    """The cloud of the points: thinned, with normals, rotated so that y is up, moved to its origin."""
     up, count, before = how.up, how.num_points, points.origin
     sensor = sensor_of(path, kind, points.positions + before, how.report)
     kept = np.arange(len(points.positions))
@@ -195,11 +195,11 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
     return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=origin)
 
 
-@np.errstate(all="ignore")  # of signalling NaN, and what leaves its type: both are looked for
+@np.errstate(all="ignore")  # signalling NaN and overflow: both are checked for
 def cloud_of_ply(content: bytes) -> PointCloud:
     """The cloud in the bytes of a PLY file of points, y up: (points, ...) float32; ValueError says what is wrong.
 
-    It is for data sets, which were written whole: a row without finite numbers is a fault there.
+    For data sets, which are written by this package: a row with NaN or infinity is an error there.
     """
     columns = useful(parse_ply(content))
     broken = np.flatnonzero(~sound(columns))
@@ -217,29 +217,29 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
 
 
 def _find_origin(positions: np.ndarray) -> np.ndarray:
-    """Whole numbers (3,) to subtract from positions (n, 3) where float32 is too coarse for them, else 0."""
+    """Whole numbers (3,) to subtract from positions (n, 3) if float32 is too coarse for them, else 0."""
     low, high = inner_box(positions)
     step = np.spacing(np.float32(np.maximum(np.abs(low), np.abs(high)).max()))
     return np.floor(low) if step > COARSEST_STEP * (high - low).max() > 0 else np.zeros(3)
 
 
 def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:
-    """The columns of points spread over a mesh file's surface, or of its vertices if it has no faces (False)."""
-    from spnr_jax.formats.meshes import load_mesh  # here: points are read without the readers of meshes
+    """Columns of points sampled on a mesh file's surface (True), or of its vertices if it has no faces (False)."""
+    from spnr_jax.formats.meshes import load_mesh  # not at the top: point files need no mesh readers
 
     asset, report = load_mesh(path, transparent_parts=how.transparent_parts, kind=kind), how.report
     for line in (*([f"ignored: {'; '.join(asset.ignored)}"] if asset.ignored else []), *asset.notes):
         report(line)
     sampled = any(len(part.faces) for part in asset.parts)
     points, origin = _spread(asset, kind, how) if sampled else (vertex_points(asset), 0)
-    fields = [  # names, values, what they are where nothing is known
+    fields = [  # names, values, default value
         (POSITION, points.positions + origin, None),
         (NORMAL, points.normals, 0),
         (LINEAR, points.base_color, DEFAULTS["base_color"]),
         *(((name,), getattr(points, name), DEFAULTS[name]) for name in ("roughness", "metallic")),
     ]
-    unknown = [names for names, values, plain in fields if np.all(values == plain)]
-    if sampled and len(unknown) < len(DEFAULTS):  # a material that has a common value
+    unknown = [names for names, values, default in fields if np.all(values == default)]
+    if sampled and len(unknown) < len(DEFAULTS):  # some of the materials happens to equal its default
         unknown = []
     if not sampled and all(part.alpha is not None for part in asset.parts):
         fields.append((("alpha",), np.concatenate([part.alpha for part in asset.parts]), None))
@@ -248,16 +248,16 @@ def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:
 
 
 def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.ndarray]:
-    """Points spread over the surface of a mesh, less an origin (3,) where float32 is too coarse for them."""
+    """Points sampled on the surface of a mesh minus an origin (3,), which is 0 unless float32 is too coarse."""
     corners, report = np.stack(bounding_box(asset)), how.report
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
-    # walls and floors have few values by themselves, so only where six digits are too few
+    # walls and floors have few distinct values anyway, so this is checked only far from the origin
     _check_rounding(vertices, np.abs(corners).max(axis=0) > SIX_DIGITS * np.ptp(corners, axis=0), report)
     if kind not in TEXT_MESHES:
-        # they come as float64, also from files that have them shorter
+        # vertices are float64 here, whatever the file's type was
         short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
         _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
-    if (origin := _find_origin(corners)).any():  # before anything of it becomes float32
+    if (origin := _find_origin(corners)).any():  # before anything is converted to float32
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     count = max(CUT_MESH if how.cut.is_given else 0, how.num_points or MESH_POINTS)
     report(f"{count} points spread over the surface of the mesh")
@@ -265,7 +265,7 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
 
 
 def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
-    """The useful columns of a point file inside the box to be cut out, of very many points those of a random sample."""
+    """The columns in use of a point file, inside the crop box; a random sample of very large files."""
     cut, report = how.cut, how.report
     capacity, broken, outside = max(CAPACITY, cloud_arrays.THINNING * (how.num_points or 0)), 0, 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -301,7 +301,7 @@ def _read_columns(pieces: Iterator[Columns], how: Reading) -> Columns:
 
 
 def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
-    """What the columns mean; of points that were not sampled from a mesh, equal and nearly equal ones count once."""
+    """Interprets the columns; equal and nearly equal points are merged, unless they were sampled on a mesh."""
     report = how.report
     if not sampled:
         columns = _without_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
@@ -327,7 +327,7 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
 
 
 def _without_no_data(columns: Columns, report: Report) -> Columns:
-    """The points without those whose place, often 0 0 0 among others, or whose height says that there is none."""
+    """The points without those that mean "no data": many at 0 0 0 among others, or at a height of NO_DATA."""
     positions = stack_columns(columns)
     nowhere, low = np.asarray(~positions.any(axis=1)), np.isin(positions[:, 2], NO_DATA)
     places, heights = positions[~nowhere], positions[~low, 2]
@@ -341,7 +341,7 @@ def _without_no_data(columns: Columns, report: Report) -> Columns:
 
 
 def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> None:
-    """A line for each of some axes (3,) that has far fewer values than another, far apart."""
+    """Reports each of the chosen axes (mask (3,)) with far fewer distinct values than another axis, far apart."""
     if not axes.any():
         return
     counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
@@ -351,7 +351,7 @@ def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> 
 
 
 def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
-    """A line where the file's columns round an axis coarsely or are degrees; ValueError where no shape is left."""
+    """Reports axes that the file rounds coarsely, and degrees; ValueError if rounding has destroyed the shape."""
     low, high = inner_box(positions)
     x, y, z = extent = high - low
     farthest = np.maximum(np.abs(low), np.abs(high))
@@ -363,7 +363,7 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
         found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
     for axis, step, width, far, column in zip("xyz", steps, extent, farthest, positions.T, strict=True):
-        fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text, of numbers that were short
+        fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text of numbers that were float32
         step = step or fits * np.spacing(np.float32(far))
         if step > LOST_STEP * width > 0:
             report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
@@ -374,13 +374,13 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
 
 
 def _check_values(points: Points, report: Report) -> None:
-    """Puts right what the file says of points, and leaves out its normals, where the points speak against them."""
+    """Fills in missing colours (black among others) and removes normals that contradict the points."""
     positions, values, _ = points
     tree, black = cKDTree(positions), np.asarray(~values["base_color"].any(axis=1))
     if 0.1 < (share := black.mean()) < 0.9:
         rows = np.flatnonzero(black)
         near = tree.query(positions[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]
-        if black[near].mean() < share + 0.25 * (1 - share):  # they lie among the others as if chosen by chance
+        if black[near].mean() < share + 0.25 * (1 - share):  # they lie among the others at random
             of_all = f"{len(rows):,} of {len(black):,} points"
             report(f"{of_all} have no colour (0 0 0): that of their neighbours is taken")
             near = cKDTree(positions[~black]).query(positions[black], 3)[1]
@@ -395,7 +395,7 @@ def _check_values(points: Points, report: Report) -> None:
 
 
 def _doubt(positions: np.ndarray, tree: cKDTree, normals: np.ndarray) -> str:
-    """Why normals (n, 3), 0 where unknown, are not those of the surface of the points; empty if they may be."""
+    """Why normals (n, 3), 0 where unknown, cannot be those of the surface; empty if they can."""
     known = np.flatnonzero(normals.any(axis=1))
     if len(known) < LEAST_POINTS:
         return ""

@@ -1,17 +1,17 @@
-"""What the columns of a file mean, of points and of meshes alike: names in common use, ranges, and defaults.
+"""The meaning of a file's columns, for points and meshes alike: known names, ranges, defaults.
 
-`useful` renames the columns that matter to
+`useful` renames the columns in use to
 
     x y z                           position
-    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed
+    base_color_r ...                base colour, linear; red green blue: sRGB; rgb, rgba: packed sRGB
     roughness metallic              in [0, 1]
     nx ny nz                        normal, of any length
-    intensity                       of a laser's echo, shown as grey where there is no colour
-    alpha opacity splat_opacity     how much a point hides; the last of Gaussian splats
+    intensity                       of a laser return, shown as grey if there is no colour
+    alpha opacity splat_opacity     opacity; the last of Gaussian splats
     classification withheld         of laser scans
 
-and drops the others.  Colours are sRGB unless the name says that they are linear.  Their range is that of the type for
-8-bit integers; else the first of 1, 100 (of fractions), 255, 1023, 4095 and 65535 that nearly all of them keep to.
+and drops the others.  Colours are sRGB unless their name says linear.  Their range is 255 for 8-bit integers, else the
+smallest of 1, 100 (for fractions), 255, 1023, 4095 and 65535 that nearly all values lie below.
 """
 
 import re
@@ -30,7 +30,7 @@ Report = Callable[[str], None]
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-# of names: CloudCompare's word for all but positions and colours, separators, British spelling, and whose it is
+# ignored in names: CloudCompare's prefix, separators, British spelling, and words such as `vertex`
 SILENT = re.compile(r"^scalar_|[\s.:_-]+|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)")
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
@@ -38,7 +38,7 @@ PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
 PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
 HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "höhe", "hoehe", "cota")
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
-ALIASES = {  # ours -> what stands for it, without separators; the first group that is there counts
+ALIASES = {  # our names -> groups of names in files, without separators; the first complete group is taken
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
     + [names.split() for names in others.split("|") if names]
@@ -55,29 +55,29 @@ ALIASES = {  # ours -> what stands for it, without separators; the first group t
         *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
 }
-# where none of these is there: columns whose names differ in one word, and do not speak of other things
+# if no group is complete: columns whose names differ in one word only, and are not about other things
 WORDS = ((POSITION, "x y z"), (SRGB, "r g b"), (SRGB, "red green blue"))
 OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera")
 NAMES = {name for group in ALIASES.values() for names in group for name in names}
 ARRAYS = {name.removesuffix("0") for name in NAMES}
-OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # beginnings of names
+OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # prefixes
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
-ROUNDING = 1e-4  # values this far outside [0, 1] are taken for rounded ones
-STRAYS, LEAST = 1000, 100  # one value of so many may leave the range, of so many at least
-DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of the colours that is worth a line
-BRIGHTEST = 0.99  # quantile of the intensities that is shown white; as many are black
+ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
+STRAYS, LEAST = 1000, 100  # one outlier in STRAYS values is allowed, if there are at least LEAST
+DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of black colours that is reported
+BRIGHTEST = 0.99  # quantile of the intensities shown as white; its complement is shown as black
 LEAST_GREY = 0.5 / 255
-SHORTEST = 1e-30  # normal that still has a direction
-FOG, INVISIBLE = 0.2, 0.02  # least opacity of splats, below which they are fog, and of other points
+SHORTEST = 1e-30  # length of a normal below which it has no direction
+FOG, INVISIBLE = 0.2, 0.02  # opacity below which splats, and other points, are left out
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
 def name_columns(fields: dict[str, np.ndarray]) -> Columns:
-    """Columns (points,) of fields of numbers (points,) or (points, c); of two to four of one name name:0, name:1 ...
+    """Columns (points,) of numeric fields (points,) or (points, c), c < 5; named name:0, name:1 ... as in ParaView.
 
-    So ParaView names them; fields of more numbers are none.
+    Wider fields are dropped.
     """
     columns: Columns = {}
     for name, values in fields.items():
@@ -89,12 +89,12 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
 
 
 def plain_name(name: str) -> str:
-    """A name in small letters without what says nothing."""
+    """The name in lower case without its ignored parts."""
     return SILENT.sub("", name.strip().lower())
 
 
 def _differing(columns: Columns, words: str) -> list[str]:
-    """Names of columns that differ in one word alone, which is each of these."""
+    """Names of columns that are equal except for one word, which is each of `words`."""
     first = rf"(?<![^\W_]){words.split()[0]}(?![^\W_])"
     for name in columns:
         names = [re.sub(first, word, name) for word in words.split()]
@@ -104,7 +104,7 @@ def _differing(columns: Columns, words: str) -> list[str]:
 
 
 def rename(columns: Columns) -> Columns:
-    """The columns that matter, under their one name; packed colours are numbers of at least four bytes."""
+    """The columns in use under our names; packed colours need at least four bytes."""
     plain = {plain_name(name): x for name, x in columns.items()} | columns
     found: Columns = {}
     for ours, theirs in ALIASES.items():
@@ -114,7 +114,7 @@ def rename(columns: Columns) -> Columns:
         if ours[0] not in found:
             found |= dict(zip(ours, map(columns.__getitem__, _differing(columns, words)), strict=False))
     colored = any(set(names) <= found.keys() for names in (LINEAR, SRGB, ("rgb",)))
-    if not colored and found.get("alpha") is plain.get("a"):  # a name that beside no colours may mean anything
+    if not colored and found.get("alpha") is plain.get("a"):  # without colours, `a` may mean anything
         found.pop("alpha", None)
     if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
@@ -125,12 +125,12 @@ def rename(columns: Columns) -> Columns:
 
 
 def name_places(names: list[str]) -> bool:
-    """Whether columns of these names hold positions, or one is x."""
+    """Whether columns with these names hold positions, or one is x."""
     return "x" in names or set(POSITION) <= rename(dict.fromkeys(names, np.zeros(1))).keys()
 
 
 def useful(columns: Columns) -> Columns:
-    """The columns of points that matter, under their one name; ValueError if there are no positions."""
+    """The columns in use under our names; ValueError if there are no positions."""
     found = rename(columns)
     if not set(POSITION) <= found.keys():
         names = " ".join(columns) or "none"
@@ -139,7 +139,7 @@ def useful(columns: Columns) -> Columns:
 
 
 def describe_use(columns: Columns) -> list[str]:
-    """Lines about the columns of points that do not matter, but for those of splats, and about names that are new."""
+    """Lines about columns that are not used (except those of splats), and about names that were guessed."""
     used = {id(x): ours for ours, x in rename(columns).items()}
     left = [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
     new = [name for name, x in columns.items() if id(x) in used and plain_name(name) not in NAMES]
@@ -149,25 +149,25 @@ def describe_use(columns: Columns) -> list[str]:
 
 
 def list_names(names: list[str]) -> str:
-    """The first names, of limited length, for a sentence."""
+    """The first names, shortened, for a message."""
     return ", ".join(name[:LONGEST_NAME] for name in names[:SHOWN_NAMES])
 
 
 def sound(columns: Columns) -> np.ndarray:
-    """Mask (points,) of rows whose position, colour, opacity and materials are numbers that float32 holds."""
-    # of which text has not all digits
+    """Mask (points,) of the rows whose position, colour, opacity and materials are finite in float32."""
+    # 0.999: text may round the largest number up
     mask, largest = np.ones(len(columns["x"]), bool), 0.999 * np.finfo(np.float32).max
     for name in columns.keys() - {*NORMAL, "intensity", "rgb", "rgba", "classification", "withheld"}:
         values = np.asarray(columns[name], np.float64)
-        # infinite is what an opacity of 0 or 1 is before the logistic function
+        # splats of opacity 0 or 1 have an infinite logit
         mask &= ~np.isnan(values) if name == "splat_opacity" else np.abs(values) < largest
     return mask
 
 
 def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
-    """The rows that are to be seen: without noise and withheld points of scanners, fog, and what is transparent.
+    """The rows without transparent points, fog of splats, and noise and withheld points of scanners.
 
-    With `keep_noise` all of them; a line about each kind that is left out.
+    With `keep_noise` all rows.  `report` gets a line about each kind that is left out.
     """
     wanted = np.ones(len(columns["x"]), bool)
     left_out = {
@@ -187,25 +187,25 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
 
 def invisible(columns: Columns) -> np.ndarray:
-    """True for points that hide next to nothing; for none where the file does not say so, or says it of all."""
+    """Mask (points,) of nearly transparent points; none if the file has no opacity, or only zeros."""
     nothing = np.zeros(len(columns["x"]))
     values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
     low, high = values.min(initial=0), values.max(initial=0)
     if "splat_opacity" in columns or low < 0:
-        # as Kerbl et al. write it, before the logistic function, unless all are 0 to 1
+        # logits, as Kerbl et al. write them, unless all are 0 to 1
         return values < (FOG if low >= 0 and high <= 1 else np.log(FOG / (1 - FOG)))
     if "alpha" not in columns and "rgba" in columns:
         columns["alpha"] = _unpack(columns["rgba"])[:, 3]
     values = columns.get("alpha", columns.get("opacity", nothing))
     highest = float(values.max(initial=0))
-    # packed colours have 0 where nobody wrote an alpha
+    # packed colours have an alpha of 0 if none was written
     return values < (INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2) if highest > 0 else -np.inf)
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
     """base_color (points, 3) linear, roughness and metallic (points,); `report` gets a line for each assumption.
 
-    `materials_known` (points,) is 0 where the file has neither of the latter.
+    If the file has neither roughness nor metallic, also `materials_known` (points,), all 0.
     """
     count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
     found |= {name: _unit_interval(columns[name], name) for name in ("roughness", "metallic") if name in columns}
@@ -219,9 +219,9 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
 
 
 def normals(columns: Columns) -> np.ndarray | None:
-    """Normals (points, 3) of unit length, 0 where a row has none that can be used; None if no row has one."""
+    """Unit normals (points, 3), 0 in rows without a valid one; None if no row has one."""
     if not set(NORMAL) <= columns.keys() or any(columns[name].dtype.kind == "u" for name in NORMAL):
-        return None  # numbers without a sign encode a normal in some way of their own
+        return None  # unsigned numbers: an encoding that is not known
     vectors = stack_columns(columns, NORMAL)
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = np.isfinite(length) & (length > SHORTEST)
@@ -229,9 +229,9 @@ def normals(columns: Columns) -> np.ndarray | None:
 
 
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
-    """Linear base colours (points, 3) from the columns that hold some, None if there are none."""
+    """Linear base colours (points, 3), from colours or intensities; None if there are none."""
     intensity = np.asarray(columns.get("intensity", [np.nan]), np.float64)
-    # a lidar's record has colours whether or not it saw them
+    # LAS records have colour fields even if the scanner saw none
     sharp = "intensity" in columns and set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
     unseen = sharp and not any(columns[name].any() for name in SRGB)
     if not unseen and (found := colors_of(columns)) is not None:
@@ -246,13 +246,13 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
         return None
     unknown = f", {int((~known).sum()):,} without one as 0.5" if not known.all() else ""
     report(f"no colour in the file: intensity {dark:g}..{bright:g} shown as grey{unknown}")
-    # never 0, which means that there is no colour
+    # never 0, which means no colour
     grey = np.where(known, np.clip((intensity - dark) / (bright - dark), LEAST_GREY, 1), 0.5)
     return srgb_to_linear(np.repeat(grey[:, None], 3, axis=-1))
 
 
 def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
-    """Roughness or metallic in [0, 1], rounding errors removed; ValueError if they are not."""
+    """Roughness or metallic in [0, 1], without rounding errors; ValueError if they lie outside."""
     scaled = values / full_scale(values.dtype, float(values.max(initial=0)), linear=True)
     if not (scaled.min() >= -ROUNDING and scaled.max() <= 1 + ROUNDING):
         raise UserError(f"has {name} from {scaled.min():g} to {scaled.max():g}; expected 0 to 1")
@@ -263,9 +263,9 @@ def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
-    """Linear colours (n, 3) of renamed columns and lines about how they were read; None if none are those of colours.
+    """Linear colours (n, 3) of renamed columns, and lines about how they were read; None without columns of colours.
 
-    ValueError for values that are no colours.
+    ValueError for values that cannot be colours.
     """
     for names in (LINEAR, SRGB):
         if set(names) <= columns.keys():
@@ -276,10 +276,10 @@ def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
 
 
 def _unpack(packed: np.ndarray) -> np.ndarray:
-    """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats that have their bits."""
-    if packed.dtype == np.float64:  # which is wide enough for whole numbers, also with a sign
+    """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats with these bits (PCL)."""
+    if packed.dtype == np.float64:  # holds all 32-bit integers, signed or not
         packed = np.nan_to_num(packed)
-    whole = bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())  # what has bits of colours is next to nothing
+    whole = bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())  # floats made of a colour's bits are tiny or NaN
     if packed.dtype.kind != "f" or whole:
         bits = packed.astype(np.int64).astype(np.uint32)
     else:
@@ -288,7 +288,7 @@ def _unpack(packed: np.ndarray) -> np.ndarray:
 
 
 def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> tuple[np.ndarray, list[str]]:
-    """Linear colours (n, 3) in [0, 1] of what a file holds (n, 3), and lines that say how they were read."""
+    """Linear colours (n, 3) in [0, 1] from a file's numbers (n, 3), and lines about how they were read."""
     if not len(channels):
         return np.zeros(channels.shape), []
     strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
@@ -309,7 +309,7 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
 
 
 def full_scale(kind: np.dtype, highest: float, linear: bool = False) -> float:
-    """The value that means full, of colours of this type and up to this value."""
+    """The value that means 1, for colours of this type whose highest value is `highest`."""
     if kind == np.uint8:
         return 255.0
     whole = kind.kind == "u" and kind.itemsize == 2
@@ -317,5 +317,5 @@ def full_scale(kind: np.dtype, highest: float, linear: bool = False) -> float:
         return 1.0
     if kind.kind == "f" and highest < 2:
         raise UserError(f"has colours up to {highest:g}: neither 0 to 1 nor 0 to 255")
-    # 256 where colours were multiplied by it, not by 255
+    # + 1: some writers multiply by 256
     return next((scale for scale in SCALES if highest <= scale + 1), SCALES[-1])

@@ -1,4 +1,4 @@
-"""Data sets on disk, read: objects as NumPy arrays; the form of what `spnr-data generate` writes: docs/data.md."""
+"""Reads the data sets that `spnr-data generate` writes, as NumPy arrays; docs/data.md describes their files."""
 
 import io
 import json
@@ -18,13 +18,13 @@ from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 
-ROOM = "procedural room"  # the name of the package's room in a data set
+ROOM = "procedural room"  # name of the package's room light in a data set
 LONGEST_NAME = 200  # of an object, in bytes: file systems allow 255
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectData:
-    """One object: all its points, and every view as 8-bit RGBA (straight alpha) with its condition image."""
+    """One object: its points, and all views as 8-bit RGBA (straight alpha) with their condition images."""
 
     name: str
     cloud: PointCloud
@@ -35,18 +35,18 @@ class ObjectData:
 
     @property
     def own_lights(self) -> list[Light] | None:
-        """The light of each view, where it has its own."""
+        """The light of each view, if each has its own."""
         return None if self.lights is None else [light_of(envmap) for envmap in self.lights]
 
     @property
     def num_bytes(self) -> int:
-        """Memory that the images and points take."""
+        """Bytes of the images and points in memory."""
         return self.images.nbytes + self.conditions.nbytes + sum(x.nbytes for x in jax.tree.leaves(self.cloud))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """The folder, its settings and the object names of each split."""
+    """A data set: its folder, settings and the object names of each split."""
 
     folder: Path
     settings: dict
@@ -54,11 +54,11 @@ class Dataset:
 
     @property
     def spread(self) -> Literal["random", "even"]:
-        """How the objects' points lie; of even ones the first are evenly spread, too."""
+        """Sampling of the objects' points; every prefix of an even cloud is evenly spread, too."""
         return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
 
     def check_lit_by_room(self) -> None:
-        """ValueError if one light lights all views, and it is not the room: the data set does not hold it."""
+        """ValueError if one light other than the room lights all views: the data set does not store it."""
         described = self.settings.get("environment_map")
         name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
         if name != ROOM:
@@ -69,7 +69,7 @@ class Dataset:
 
 
 def open_dataset(folder: Path | str) -> Dataset:
-    """The data set in a folder; ValueError if it is none or unfinished."""
+    """The data set in a folder; ValueError if there is none or it is unfinished."""
     folder = Path(folder)
     description = folder / "dataset.json"
     if not description.is_file():
@@ -92,13 +92,13 @@ def open_dataset(folder: Path | str) -> Dataset:
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a name in a data set's lists is that of a folder right there: no path, nothing hidden."""
+    """Whether a name in a data set's lists is a plain folder name: no path, not hidden."""
     plain = name.isprintable() and not (name.startswith(".") or set(name) & set("/\\:"))
     return plain and 0 < len(name) <= LONGEST_NAME
 
 
 def read_object(dataset: Dataset, name: str) -> ObjectData:
-    """One object of the data set; ValueError names the file that is missing or broken."""
+    """One object of the data set; ValueError names a missing or broken file."""
     folder = dataset.folder / "objects" / name
     file = "transforms.json"
 
@@ -125,7 +125,7 @@ def read_object(dataset: Dataset, name: str) -> ObjectData:
 
 
 def has_lights(dataset: Dataset) -> bool:
-    """Whether each view of the data set has a light of its own."""
+    """Whether each view of the data set has its own light."""
     described = dataset.settings.get("environment_map")
     return isinstance(described, dict) and "kinds" in described
 
@@ -152,12 +152,12 @@ def on_white(rgba: np.ndarray) -> np.ndarray:
 
 
 def first_points(item: ObjectData, count: int) -> PointCloud:
-    """So many points of an object, or all if it has fewer: always the same ones."""
+    """The first `count` points of an object, or all if it has fewer."""
     return jax.tree.map(lambda values: values[:count], item.cloud)
 
 
 def check_resolution(data: ObjectData, config: TrainConfig) -> None:
-    """ValueError if an object's images do not have the size that the config's network is trained on."""
+    """ValueError if an object's images do not have the size on which the config's network is trained."""
     size = config.model.image_resolution
     if (data.camera.height, data.camera.width) != (size, size):
         raise UserError(

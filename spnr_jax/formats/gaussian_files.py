@@ -1,13 +1,13 @@
 """Gaussian splats as files: .ply of Kerbl et al. 2023 and .spz of Niantic, written and read; compressed .ply, read.
 
-    .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity before the logistic
-            function, logarithms of the scales, rotation w x y z, all float32; axes right, down, forward
-    .spz    gzip; a header of 16 bytes, then all places (24-bit fixed point an axis), all opacities (8 bits), colours,
-            logarithms of scales, rotations (32 bits), harmonics; axes right, up, back.  Versions 2 and 3 are read
-    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats; places in it have 11, 10 and 11 bits
+    .ply    x y z, nx ny nz (0), f_dc_0..2, f_rest_* (red, then green, then blue), opacity logits, log scales,
+            rotation w x y z, all float32; axes right, down, forward
+    .spz    gzip; a header of 16 bytes, then all positions (24-bit fixed point), all opacities (8 bits), colours, log
+            scales, rotations (32 bits), spherical harmonics; axes right, up, back.  Versions 2 and 3 are read
+    .ply    of PlayCanvas: an element `chunk` with the box of each 256 splats; positions in it have 11, 10 and 11 bits
 
-The first two say that splats which a viewer widens to a pixel lose opacity for it (anti-aliasing, mip).  Splats go in
-with y up and z towards the viewer, in any unit; a note becomes a comment of the .ply.  Read are coloured points.
+The first two are marked as anti-aliased (Mip-Splatting: splats widened to a pixel lose opacity).  Splats are passed in
+with y up and z towards the viewer, in any unit; a note becomes a comment of the .ply.  Read as coloured points.
 """
 
 import gzip
@@ -25,26 +25,26 @@ from spnr_jax.kernels.records import Gaussians
 from spnr_jax.surfels.gaussians import C0, degree_of, half_turn_signs
 
 SUFFIXES = (".ply", ".spz")
-LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # that the logistic function is inverted for
-RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply: what a viewer widens it makes fainter
-# of .spz: what it begins with, the versions that are read (the last is written), a flag of the header, bytes of that
+LEAST_OPACITY, MOST_OPACITY = 1e-4, 1 - 1e-4  # bounds that keep logits finite
+RENDER_MODE = "SplatRenderMode: mip"  # comment of a .ply that marks it as anti-aliased
+# of .spz: first bytes, versions that are read (the last is written), header flag, bytes of the header
 MAGIC, VERSIONS, ANTIALIASED, HEAD = b"NGSP", (2, 3), 1, 16
-FRACTION_BITS = 24 - 2  # at most of a place in .spz; fewer where places lie further from the origin than 1
-SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps for each e-fold, logarithm of the smallest
-HARMONIC_BITS = (5, 4)  # of .spz: of the coefficients of degree 1, and above
-PACKED = 9 + 1 + 3  # bytes of a splat up to its colour
-MOST_BYTES = 2**30  # when unpacked: a small file can announce any number
+FRACTION_BITS = 24 - 2  # of a position in .spz; fewer if positions are larger than 1
+SCALE_STEP, LEAST_SCALE = 16, -10  # of .spz: steps per unit of log scale, smallest log scale
+HARMONIC_BITS = (5, 4)  # of .spz: for coefficients of degree 1, and above
+PACKED = 9 + 1 + 3  # bytes of a splat's position, opacity and colour
+MOST_BYTES = 2**30  # when unpacked: a small file can declare any size
 CHUNK = 256  # splats
-PACKED_BITS = {  # of a compressed .ply: the property, and the place and number of its bits
+PACKED_BITS = {  # of a compressed .ply: property, first bit, number of bits
     **{"x": ("packed_position", 21, 11), "y": ("packed_position", 11, 10), "z": ("packed_position", 0, 11)},
     **{name: ("packed_color", 24 - 8 * i, 8) for i, name in enumerate((*SRGB, "splat_opacity"))},
 }
-COLOR_STEP = 0.15  # 255 steps for 1 / COLOR_STEP of a coefficient
+COLOR_STEP = 0.15  # of .spz: a colour coefficient times COLOR_STEP has 255 steps
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 
 def write_splats(path: str | Path, gaussians: Gaussians, note: str = "") -> int:
-    """Writes a file of the kind that its suffix says, in one piece; its size in bytes.  ValueError for others."""
+    """Writes a file of its suffix's kind, atomically; returns its size in bytes.  ValueError for other suffixes."""
     path = Path(path)
     check_suffix(path)
     content = ply_of(gaussians, note) if path.suffix.lower() == ".ply" else spz_of(gaussians)
@@ -53,14 +53,14 @@ def write_splats(path: str | Path, gaussians: Gaussians, note: str = "") -> int:
 
 
 def check_suffix(path: Path) -> None:
-    """ValueError unless the path is that of a file of splats, where one can be written."""
+    """ValueError unless the path has a suffix of splats and can be written."""
     if path.suffix.lower() not in SUFFIXES:
         raise UserError(f"{path}: splats are written as {' or '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
     check_place(path)
 
 
 def turn_half(gaussians: Gaussians) -> Gaussians:
-    """The splats half a turn around the x axis: axes right, up, back become right, down, forward, and back again."""
+    """The splats rotated by 180 degrees about x: from axes right, up, back to right, down, forward, or back."""
     harmonics, (w, x, y, z) = np.asarray(gaussians.harmonics, np.float32), np.asarray(gaussians.rotation, np.float32).T
     return Gaussians(
         scale=gaussians.scale,
@@ -105,7 +105,7 @@ def spz_of(gaussians: Gaussians) -> bytes:
         _bytes(harmonics[:, 0] * COLOR_STEP * 255 + 127.5),
         _bytes((np.log(scale) - LEAST_SCALE) * SCALE_STEP),
         _smallest_three(rotation),
-        # whose lowest bits are those of the middle of a step, as the format's own writer rounds them
+        # rounded to the middle of a step, as by the format's reference writer
         _bytes(np.round((harmonics[:, 1:] * 128 + 128) / step) * step),
     ]
     return gzip.compress(b"".join(parts), mtime=0)
@@ -116,7 +116,7 @@ def _bytes(values: np.ndarray) -> bytes:
 
 
 def _smallest_three(rotation: Float[np.ndarray, "splats 4"]) -> bytes:
-    """Rotations as 32 bits: which of x y z w is largest, and sign and nine bits of each of the others."""
+    """Rotations in 32 bits: index of the largest of x y z w, then sign and nine bits of each of the others."""
     quaternion = rotation[:, [1, 2, 3, 0]]
     largest = np.abs(quaternion).argmax(axis=1)
     quaternion = quaternion * np.where(np.take_along_axis(quaternion, largest[:, None], 1) < 0, -1, 1)
@@ -128,7 +128,7 @@ def _smallest_three(rotation: Float[np.ndarray, "splats 4"]) -> bytes:
 
 
 def spz_columns(path: Path) -> Columns:
-    """The columns of a .spz file; ValueError for other versions than 2 and 3."""
+    """The columns of a .spz file of version 2 or 3; ValueError for others."""
     content = path.read_bytes()
     with refusing("is a broken .spz file"):
         content = content if content[:4] == MAGIC else zlib.decompressobj(wbits=31).decompress(content, MOST_BYTES)
@@ -149,7 +149,7 @@ def spz_columns(path: Path) -> Columns:
 
 
 def unpack_columns(chunks: Columns, packed: Columns) -> Columns:
-    """The columns of a compressed .ply from its elements `chunk` and `vertex`."""
+    """The columns of a compressed .ply, from its elements `chunk` and `vertex`."""
     columns = {}
     with refusing("is a broken file of compressed splats"):
         for name, (source, shift, size) in PACKED_BITS.items():

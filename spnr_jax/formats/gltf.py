@@ -1,16 +1,13 @@
 """glTF 2.0 scenes, .gltf or .glb, as parts: one per primitive of a node or instance; skins in the pose of the nodes.
 
-Read here and not through trimesh, which leaves integers unscaled and drops fans (docs/lab/readers.md); tests compare
-the rest with it.  DracoPy (KHR_draco_mesh_compression) and meshoptimizer (EXT_, KHR_meshopt_compression) are extras.
+Not read through trimesh, which leaves integers unscaled and drops fans (docs/lab/readers.md); tests compare with it.
 
 base colour = factor x texture (sRGB -> linear); roughness = factor x G, metallic = factor x B of the metallic-roughness
 texture; defaults white, 1, 1. KHR_materials_pbrSpecularGlossiness is converted with the formulas of the extension's
-reference converter.  A material has one set of coordinates, that of its first texture; a texture that lies differently
-is replaced by its mean.  What is not modelled is named in `ignored`.
+reference converter.  A material has the texture coordinates of its first texture; a texture with other coordinates is
+replaced by its mean.  Features that are not modelled are listed in `ignored`.
 """
 
-import json
-import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -20,50 +17,42 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spnr_jax.errors import UserError, refusing
+from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
 from spnr_jax.formats.columns import LONGEST_NAME, Columns
+from spnr_jax.formats.gltf_file import DRACO, MESHOPT, GltfFile
 from spnr_jax.kernels.triangles import strip_faces
 
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-CHUNK_JSON = 0x4E4F534A  # of a .glb
 LOOSE = {"POINTS", "LINES", "LINE_LOOP", "LINE_STRIP"}
 MODES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", "TRIANGLES", "TRIANGLE_STRIP", "TRIANGLE_FAN")))
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = 9728
-DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
 BASIS, WEBP, MOVED = "KHR_texture_basisu", "EXT_texture_webp", "KHR_texture_transform"
 INSTANCES, VISIBILITY, SPLATS = "EXT_mesh_gpu_instancing", "KHR_node_visibility", "KHR_gaussian_splatting"
 READ = {MOVED, WEBP, BASIS, DRACO, *MESHOPT, INSTANCES, VISIBILITY, SPLATS, "KHR_mesh_quantization"}
-LIGHTS = "KHR_lights_punctual"  # which are dropped, and named
-HARMLESS = {  # a scene looks the same without them
+LIGHTS = "KHR_lights_punctual"  # ignored, with a note
+HARMLESS = {  # do not change the picture
     *("KHR_animation_pointer", "KHR_xmp_json_ld", "EXT_structural_metadata", "EXT_mesh_features"),
     *("KHR_node_hoverability", "KHR_node_selectability", "VRM", "VRMC_vrm"),
 }
-MATERIALS = "KHR_materials_"  # of which those that are not modelled are named one by one
+MATERIALS = "KHR_materials_"  # prefix; the ones that are not modelled are listed in `ignored`
 MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}, ("JOINTS_", "WEIGHTS_")
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
-FILTERS = {  # of meshopt: the library's function, and the widths of a vertex
-    "OCTAHEDRAL": ("decode_filter_oct", (4, 8)),
-    "QUATERNION": ("decode_filter_quat", (8,)),
-    "EXPONENTIAL": ("decode_filter_exp", range(4, 257, 4)),
-}
-RGB = slice(3)  # of the channels of texels
-DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # of texels of a normal map
+RGB = slice(3)  # channels of texels
+DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # components by the texels of a normal map
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
-# texels in place of a missing image: grey 0.5, roughness 0.5 of a non-metal, a specular colour of 0.04, flat
+# texels instead of a missing image: grey 0.5; roughness 0.5, metallic 0; specular 0.04, glossiness 0.5; flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
-# Vertices and faces that are drawn again, beside each mesh's first: a small file could ask for any number.  To draw a
-# mesh again costs as much as PLACING faces.
+# Limit of vertices and faces in repeated meshes, because a small file could ask for any number; each repetition costs
+# as much as PLACING faces.
 MOST_REPEATED, PLACING = 2**23, 64
 REPEATS = f"repeats its meshes more than can be read ({MOST_REPEATED} vertices and faces)"
 
 
 def load_gltf(path: Path, loading: Loading) -> list[Part]:
-    """The scene's triangles with their materials, as they lie in the file."""
+    """The triangles of the default scene with their materials, in file order."""
     file, ignored = GltfFile(path, loading), loading.ignored
     document = file.document
     for extension in document.get("extensionsRequired", []):
@@ -71,13 +60,13 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
             raise UserError(f"needs {extension}, which cannot be read: export it without that extension")
     drawn = list(list_primitives(file))
     modes = {id(primitive): MODES[primitive.get("mode", 4)] for primitive, *_ in drawn}
-    # points are read where there is nothing else
+    # points are read if there are no triangles
     wanted = "POINTS" if not loading.strict and modes and set(modes.values()) <= LOOSE else "TRIANGLE"
     ignored |= {"animations"} & document.keys()
     others = {*document.get("extensionsUsed", [])} - READ - HARMLESS
     ignored |= {name for name in others if not name.startswith(MATERIALS)}
     read_look = cache(partial(read_material, file))
-    shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id: the document keeps every primitive alive
+    shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id of the primitive, which the document keeps alive
     parts, repeated = [], 0
     for primitive, matrix, joints in drawn:
         if not (mode := modes[id(primitive)]).startswith(wanted):
@@ -113,10 +102,10 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     return parts
 
 
-def list_primitives(file: "GltfFile") -> Iterator[tuple[dict, np.ndarray, np.ndarray | None]]:
-    """(primitive, matrix to world (4, 4), those of its skin's joints (j, 4, 4)) of all that is drawn, depth first.
+def list_primitives(file: GltfFile) -> Iterator[tuple[dict, np.ndarray, np.ndarray | None]]:
+    """(primitive, matrix to world (4, 4), its skin's joint matrices (j, 4, 4) or None) of the default scene.
 
-    Of the default scene: every primitive of each node's mesh, or of each of its instances.
+    Every primitive of each node's mesh and of each of its instances, depth first.
     """
     document = file.document
     nodes, world = document.get("nodes", []), dict[int, np.ndarray]()
@@ -140,7 +129,7 @@ def list_primitives(file: "GltfFile") -> Iterator[tuple[dict, np.ndarray, np.nda
     joints_of, placed = cache(lambda skin: _joints(file, document["skins"][skin], world)), 0
     for index in shown:
         node, joints, moves = nodes[index], None, Columns()
-        if "skin" in node:  # then the place of the node itself does not count
+        if "skin" in node:  # the node's own matrix does not apply to skinned meshes
             joints = joints_of(node["skin"])
         elif INSTANCES in node.get("extensions", {}):
             moves = file.columns(node["extensions"][INSTANCES]["attributes"], *MOTION)
@@ -156,7 +145,7 @@ def _count(moves: Columns) -> int:
 
 
 def _matrices(moves: Columns) -> np.ndarray:
-    """The matrices (n, 4, 4) of scales, then rotations (x, y, z, w), then translations; of no moves, one identity."""
+    """Matrices (n, 4, 4) of scales, then rotations (x, y, z, w), then translations; one identity without any."""
     count = _count(moves)
     if any(len(move) != count for move in moves.values()):
         raise UserError("has instances with several numbers of places, turns or sizes: broken file")
@@ -168,27 +157,27 @@ def _matrices(moves: Columns) -> np.ndarray:
     return matrices
 
 
-def _joints(file: "GltfFile", skin: dict, world: dict[int, np.ndarray]) -> np.ndarray:
-    """The matrices (j, 4, 4) by which the joints of a skin move what hangs on them."""
+def _joints(file: GltfFile, skin: dict, world: dict[int, np.ndarray]) -> np.ndarray:
+    """The skinning matrices (j, 4, 4) of a skin's joints: world matrix times inverse bind matrix."""
     joints = np.stack([world.get(joint, np.eye(4)) for joint in skin["joints"]])
     if "inverseBindMatrices" in skin:
         inverse = file.accessor(skin["inverseBindMatrices"]).astype(np.float64)
         if len(inverse) < len(joints):
             raise UserError(f"has {len(joints)} joints in a skin and {len(inverse)} matrices of them: broken file")
         joints = joints @ np.swapaxes(inverse[: len(joints)].reshape(-1, 4, 4), 1, 2)
-    elsewhere = [joint not in world for joint in skin["joints"]]  # in another scene: what hangs on it is at rest
+    elsewhere = [joint not in world for joint in skin["joints"]]  # in another scene: identity
     return np.where(np.array(elsewhere)[:, None, None], np.eye(4), joints)
 
 
 def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray | None:
-    """The matrices (v, 4, 4) of vertices by the joints that they hang on, four or more each; None if they name none."""
+    """Linear blend skinning: matrices (v, 4, 4) of the vertices, of four or more joints each; None without joints."""
     parts = [[columns[name] for name in sorted(columns) if name.startswith(of)] for of in SKIN]
     if not all(parts):
         return None
     numbers, weights = np.concatenate(parts[0], axis=1), np.concatenate(parts[1], axis=1).astype(np.float64)
     if numbers.shape != weights.shape:
         raise UserError("has a skin with other numbers of joints than of weights: broken file")
-    numbers = np.where(weights > 0, numbers, 0).astype(np.int64)  # joints without weight may be any
+    numbers = np.where(weights > 0, numbers, 0).astype(np.int64)  # joints with weight 0 may have any number
     if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= len(joints):
         raise UserError(f"has vertices on joint {numbers.max()} of {len(joints)}: broken file")
     weights[weights.sum(axis=1) <= 0, 0] = 1
@@ -196,11 +185,11 @@ def _bend(columns: Columns, joints: np.ndarray) -> np.ndarray | None:
     return sum(weights[:, i, None, None] * joints[numbers[:, i]] for i in range(numbers.shape[1]))
 
 
-def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
-    """The columns (v, width) that a material needs, and the faces (f, 3), of a primitive in its own frame."""
+def _shape(file: GltfFile, primitive: dict, mode: str, texcoords: str) -> tuple[Columns, np.ndarray]:
+    """The vertex columns (v, width) in use and the faces (f, 3) of a primitive, in its own frame."""
     if DRACO in primitive.get("extensions", {}):
         file.unpack_mesh(primitive)
-        mode = "TRIANGLES"  # whatever it was: Draco keeps triangles
+        mode = "TRIANGLES"  # Draco stores triangles, whatever the mode was
     attributes = primitive["attributes"]
     wanted = ("POSITION", "NORMAL", "COLOR_0", texcoords, *(name for name in attributes if name.startswith(SKIN)))
     count = len(file.accessor(attributes["POSITION"]))
@@ -210,7 +199,7 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
         kept, places = np.unique(order, return_inverse=True)
         counts = {file.document["accessors"][index]["count"] for name, index in attributes.items() if name in wanted}
         if counts == {count} and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
-            order, used = places, kept  # the other vertices are those of other primitives
+            order, used = places, kept  # the other vertices belong to other primitives
     columns = file.columns(attributes, *wanted, rows=used)
     if mode == "POINTS":
         return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
@@ -222,156 +211,32 @@ def _shape(file: "GltfFile", primitive: dict, mode: str, texcoords: str) -> tupl
 
 
 def _place(columns: Columns, faces: np.ndarray, material: Material, place: "Placement", matrix: np.ndarray) -> Part:
-    """One primitive in world space, by one matrix (4, 4) or one for each vertex (v, 4, 4)."""
+    """The part of a primitive in world space, by one matrix (4, 4) or one per vertex (v, 4, 4)."""
     linear = matrix[..., :3, :3]
-    turned_over = np.linalg.det(linear) < 0
-    side = -1 if 2 * np.sum(turned_over) > np.size(turned_over) else 1
-    # of the matrix, a multiple of the inverse transpose that is defined where it is singular too
+    mirrored = np.linalg.det(linear) < 0
+    side = -1 if 2 * np.sum(mirrored) > np.size(mirrored) else 1
+    # cofactor matrix: a multiple of the inverse transpose, also defined for singular matrices
     cofactors = np.cross(np.roll(linear, -1, axis=-2), np.roll(linear, -2, axis=-2))
     normals, colors, texcoords = (columns.get(name) for name in ("NORMAL", "COLOR_0", f"TEXCOORD_{place.texcoord_set}"))
     return Part(
-        positions=_turned(columns["POSITION"], linear) + matrix[..., :3, 3],
+        positions=_transform(columns["POSITION"], linear) + matrix[..., :3, 3],
         faces=faces[:, ::side],
         material=material,
-        normals=None if normals is None else _turned(normals, cofactors) * side,
+        normals=None if normals is None else _transform(normals, cofactors) * side,
         texcoords=None if texcoords is None else texcoords @ np.array(place.turn).T + np.array(place.offset),
         colors=None if colors is None else colors[:, :3],
     )
 
 
-def _turned(vectors: np.ndarray, linear: np.ndarray) -> np.ndarray:
+def _transform(vectors: np.ndarray, linear: np.ndarray) -> np.ndarray:
     return vectors @ linear.T if linear.ndim == 2 else (linear @ vectors[..., None])[..., 0]
-
-
-# --- the file ---------------------------------------------------------------------------------------------------------
-
-
-class GltfFile:
-    """The JSON document of a glTF file (`document`) with access to what its buffers hold."""
-
-    def __init__(self, path: Path, loading: Loading):
-        self.loading, data = loading, path.read_bytes()
-        text, self._binary = _split_glb(data) if data[:4] == b"glTF" else (data, None)
-        try:
-            self.document = json.loads(text.decode("utf-8-sig"))
-        except ValueError as error:
-            raise UserError(f"its glTF header is not JSON, or truncated: {error}") from None
-        version = str(self.document.get("asset", {}).get("version", "1.0"))
-        if not version.startswith("2."):
-            raise UserError(f"is glTF {version}; only glTF 2.0 can be read: convert it")
-        self.view, self._buffer = cache(self._read_view), cache(self._read_buffer)
-        self._unpacked: dict[int, np.ndarray] = {}  # accessors of Draco meshes
-
-    def columns(self, attributes: dict[str, int], *names: str, rows: np.ndarray | None = None) -> Columns:
-        """The columns (v, width) of those of a primitive's attributes that have one of the names; some rows, or all.
-
-        float64 for floats and normalised integers, int64 for other ones.
-        """
-        found = {}
-        for name, index in ((name, index) for name, index in attributes.items() if name in names):
-            values, normalized = self.accessor(index), self.document["accessors"][index].get("normalized")
-            values = values if rows is None else values[rows]
-            if values.dtype.kind == "f":
-                found[name] = values.astype(np.float64)
-            elif normalized or name == "COLOR_0":  # which always is; some writers forget to say so
-                found[name] = np.maximum(values.astype(np.float64) / np.iinfo(values.dtype).max, -1)
-            else:
-                found[name] = values.astype(np.int64)
-        return found
-
-    def accessor(self, index: int) -> np.ndarray:
-        """Values (count, width) of an accessor, as they are stored."""
-        if index in self._unpacked:
-            return self._unpacked[index]
-        accessor = self.document["accessors"][index]
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise UserError(f"accessor {index} is sparse or holds no data, which is not read: export it plain")
-        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
-        size, view = dtype.itemsize * width, self.view(number)
-        stride = self.document["bufferViews"][number].get("byteStride") or size
-        if stride < size:
-            raise UserError(f"buffer view {number} has elements that overlap: broken file")
-        if count and start + (count - 1) * stride + size > len(view):
-            raise UserError(f"buffer view {number} is shorter than its accessor says: truncated or broken file")
-        return np.ndarray((count, width), dtype, buffer=view, offset=start, strides=(stride, dtype.itemsize))
-
-    def _read_view(self, index: int) -> memoryview:
-        view = self.document["bufferViews"][index]
-        packed = next((packed for name, packed in view.get("extensions", {}).items() if name in MESHOPT), None)
-        place = packed or view
-        start, buffer = place.get("byteOffset", 0), self._buffer(place["buffer"])
-        end = start + place["byteLength"]
-        if not 0 <= start <= end <= len(buffer):
-            number = place["buffer"]
-            raise UserError(f"buffer {number} has {len(buffer)} bytes where {end} are needed: truncated file")
-        data = memoryview(buffer)[start:end]
-        return memoryview(unpack(data, packed)) if packed else data
-
-    def _read_buffer(self, number: int) -> bytes:
-        uri = self.document["buffers"][number].get("uri")
-        data = self._binary if uri is None else self.loading.read(uri, needed=True)
-        if data is None:
-            raise UserError(f"buffer {number} has no data in the file")
-        return data
-
-    def unpack_mesh(self, primitive: dict) -> None:
-        """Makes ready what a primitive keeps in a Draco mesh; whole numbers are as they were before, not normalised.
-
-        The library holds what a mesh announces against the size of its data before it makes room for it.
-        """
-        draco, packed = assets.extra("DracoPy"), primitive["extensions"][DRACO]
-        data = bytes(self.view(packed["bufferView"]))
-        try:
-            mesh = draco.decode(data)
-        except (draco.FileTypeException, ValueError, RuntimeError, MemoryError) as error:
-            raise UserError(f"holds a Draco mesh that is broken or cut off ({error})") from None
-        if getattr(mesh, "faces", None) is None:
-            raise UserError("holds Draco points where triangles are needed: broken file")
-        columns = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
-        for name, number in ({"POSITION": None} | packed["attributes"]).items():
-            if number not in columns:
-                raise UserError(f"has no {name:.40} in its Draco mesh: broken file")
-            self._unpacked[primitive["attributes"][name]] = columns[number].reshape(len(columns[number]), -1)
-        self._unpacked[primitive["indices"]] = np.asarray(mesh.faces).reshape(-1, 1)
-
-
-def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
-    """JSON text and binary chunk of a GLB file."""
-    version, length, size, kind = struct.unpack_from("<4I", data.ljust(20, b"\0"), 4)
-    if version != 2:
-        raise UserError(f"is a GLB container of version {version}; only version 2 (glTF 2.0) can be read: convert it")
-    begin = 20 + size
-    end = begin + 8 + int.from_bytes(data[begin : begin + 4], "little") if begin < length else begin
-    if (needed := max(length, end)) > len(data):
-        raise UserError(f"truncated file: it has {len(data)} bytes where {needed} are announced")
-    if kind != CHUNK_JSON:
-        raise UserError("is a GLB container without a JSON chunk")
-    return data[20:begin], data[begin + 8 : end]
-
-
-def unpack(data: memoryview, packed: dict) -> bytes:
-    """The bytes of a buffer view that meshopt packed, as its extension describes them."""
-    meshopt = assets.extra("meshoptimizer")
-    mode, count, stride, kind = packed["mode"], packed["count"], packed["byteStride"], packed.get("filter", "NONE")
-    with refusing("holds meshopt data that is broken or cut off"):
-        if mode != "ATTRIBUTES":
-            decode = {"TRIANGLES": meshopt.decode_index_buffer, "INDICES": meshopt.decode_index_sequence}[mode]
-            return decode(count, 4, data).astype({2: "<u2", 4: "<u4"}[stride]).tobytes()
-        elements = meshopt.decode_vertex_buffer(count, stride, data, np.dtype((np.void, stride)))
-    if kind == "NONE":
-        return elements.tobytes()
-    function, strides = FILTERS.get(kind, ("", ()))
-    if stride not in strides:
-        raise UserError(f"holds meshopt vertices of {stride} bytes with the filter {kind!r:.40}: cannot be read")
-    return getattr(meshopt, function)(elements, count, stride).tobytes()
 
 
 # --- materials --------------------------------------------------------------------------------------------------------
 
 
 class Placement(NamedTuple):
-    """Texture coordinates: a set of the file's, moved by uv @ turn.T + offset; plain numbers, comparable."""
+    """Texture coordinates: a set of the file, transformed by uv @ turn.T + offset; tuples, so that == works."""
 
     wrap: Wrap = "repeat"
     texcoord_set: int = 0
@@ -382,10 +247,10 @@ class Placement(NamedTuple):
 def _read_texture(
     file: GltfFile, places: list[Placement], info: dict | None, stand_in: tuple[int, ...]
 ) -> np.ndarray | None:
-    """Encoded texels (h, w, 4) of a textureInfo, or of the stand-in (4,) where its image may be missing.
+    """Encoded texels (h, w, 4) of a textureInfo, or `stand_in` (4,) for a missing image.
 
-    Where it lies is added to the material's `places`; of a texture that lies differently from the first the mean is
-    taken, (1, 1, 4).
+    Its placement is appended to the material's `places`; if that differs from the first, the texture's mean (1, 1, 4)
+    is returned.
     """
     if info is None:
         return None
@@ -400,7 +265,7 @@ def _read_texture(
 
 
 def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
-    """Texels (h, w, 4) of a texture; None where its image is missing."""
+    """Texels (h, w, 4) of a texture; None if its image is missing."""
     extensions = texture.get("extensions", {})
     webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
     source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
@@ -414,7 +279,7 @@ def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
 
 
 def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:
-    """Where a texture lies; rotations are counter-clockwise where v runs down (the extension's GLSL turns back)."""
+    """The placement of a texture; rotations are counter-clockwise with v downwards (KHR_texture_transform)."""
     sampler = file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
     wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
     if wrap != wrap_t:
@@ -430,9 +295,9 @@ def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement
 
 
 def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
-    """The material `index` of a file, None if it is nowhere seen, and where its textures lie.
+    """Material `index` of a file (None if it is invisible everywhere) and the placement of its textures.
 
-    None is glTF's default, of a rough metal, where references are made; for a picture it is white and none.
+    Index None: glTF's default, a rough metal, for references; for a picture, a white dielectric.
     """
     loading, spec = file.loading, {} if index is None else file.document["materials"][index]
     if index is None and not loading.strict:
@@ -454,7 +319,7 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
         specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
         base_color, metallic = metallic_roughness(base_color, specular)
         roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
-    # after the textures: a missing file is the plainer reason
+    # after the textures, because a missing file is the clearer error
     material = assets.make_material(base_color, roughness, metallic)
     shown = loading.cut_out(name, material, *_alpha(spec, color, (*factor, 1.0)[3]))
     if UNLIT in extensions:
@@ -472,7 +337,7 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
 
 
 def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table: np.ndarray = LEVELS) -> np.ndarray:
-    """The factor, times channels of texels (h, w, 4) by a table (256,) where there are some."""
+    """The factor, times channels of texels (h, w, 4), if any, looked up in a table (256,)."""
     factor = np.asarray(factor) if isinstance(factor, np.ndarray) else np.asarray(factor, np.float64)
     return factor if texels is None or not factor.any() else decode_texels(texels[..., channels], table) * factor
 
@@ -483,7 +348,7 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
         size = tuple(map(max, diffuse.shape[:2], specular.shape[:2]))
         diffuse, specular = (assets.resize(texels, *size) for texels in (diffuse, specular))
     bright_diffuse, bright_specular = (np.sqrt((x * x) @ np.array([0.299, 0.587, 0.114])) for x in (diffuse, specular))
-    share = (1 - specular.max(axis=-1)) / (1 - DIELECTRIC)  # of the light that the surface itself does not mirror
+    share = (1 - specular.max(axis=-1)) / (1 - DIELECTRIC)  # of the light that is not reflected specularly
     b = bright_diffuse * share + bright_specular - 2 * DIELECTRIC
     discriminant = np.maximum(b * b - 4 * DIELECTRIC * (DIELECTRIC - bright_specular), 0)
     metallic = np.clip((-b + np.sqrt(discriminant)) / (2 * DIELECTRIC), 0, 1)
@@ -495,7 +360,7 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
 
 
 def _alpha(spec: dict, color: np.ndarray | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:
-    """Why a material is said to be transparent ("": it is not), its alpha () or (h, w), and the cut-off of a mask."""
+    """The statement that makes a material transparent ("": opaque), its alpha () or (h, w), and a mask's cut-off."""
     mode, extensions = spec.get("alphaMode", "OPAQUE"), spec.get("extensions", {})
     for name, entry in TRANSPARENT.items():
         if extensions.get(f"KHR_materials_{name}", {}).get(entry, 0) > 0:

@@ -1,9 +1,9 @@
-"""Images on disk: 8-bit pictures, a depth map in colours, a turntable as a film, pages; maps of light, read.
+"""Image files: 8-bit pictures, coloured depth maps, turntable films, HTML pages; environment maps, read.
 
-Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1], sRGB.  Files are written beside their
-place and renamed into it: a reader sees the old content or the new, never half of it.
+Images are (height, width, 3) or grey (height, width), uint8 or float in [0, 1], sRGB.  Files are written under another
+name and then renamed, so a reader never sees a partial file.
 
-A light comes from an environment map (.hdr .exr), which mitsuba reads, or by the name of one of the package's.
+A light is read from an environment map (.hdr .exr; through mitsuba), or is one of the package's, by name.
 """
 
 import base64
@@ -26,13 +26,13 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import skies
 from spnr_jax.surfels.lighting import light_of
 
-ENDINGS, MOST_BYTES = (".hdr", ".exr"), 2**26  # of a map's file; one of 2048 x 1024 texels has a quarter
+ENDINGS, MOST_BYTES = (".hdr", ".exr"), 2**26  # of an environment map; 2048 x 1024 texels take a quarter
 NAMES = tuple(skies.NAMED)  # of lights
-OPAQUE = 0.5  # opacity from which a pixel's depth counts for the range of the colours
-PALETTE_PIXELS = 128  # along a side of a frame that the palette is chosen from, at least
-PALETTE_FRAMES = 24  # frames, spread over the film, that choose the colours of a GIF
-CENTISECOND = 0.01  # the clock of a GIF
-# viridis (Smith, van der Walt 2015) at 20 even places, dark to bright; lines between are off by at most 4 / 255
+OPAQUE = 0.5  # opacity from which a pixel's depth counts in the range of the colour map
+PALETTE_PIXELS = 128  # least side of the frames from which the palette is chosen
+PALETTE_FRAMES = 24  # frames, spread over the film, from which a GIF's palette is chosen
+CENTISECOND = 0.01  # time unit of a GIF
+# viridis (Smith, van der Walt 2015) at 20 even steps, dark to bright; interpolation is off by at most 4 / 255
 VIRIDIS = (
     "440154 481467 482576 453781 404688 39558c 33638d 2d718e 287d8e 238a8d "
     "1f968b 20a386 29af7f 3dbc74 56c667 75d054 95d840 bade28 dde318 fde725"
@@ -40,7 +40,7 @@ VIRIDIS = (
 
 
 def to_uint8(image: np.ndarray | Array) -> np.ndarray:
-    """The image in 8 bits; values outside [0, 1], which an upsampler can produce, are shown as black or white."""
+    """The image in 8 bits; values outside [0, 1], which an upsampler can produce, are clipped."""
     image = np.asarray(image)
     if image.dtype == np.uint8:
         return image
@@ -50,9 +50,9 @@ def to_uint8(image: np.ndarray | Array) -> np.ndarray:
 
 
 def depth_image(depth: np.ndarray | Array, acc: np.ndarray | Array) -> np.ndarray:
-    """Colours (h, w, 3) uint8 of distances (h, w), near bright and far dark, fading to white with the opacity (h, w).
+    """Colours (h, w, 3) uint8 of depths (h, w), near bright and far dark, over white by the opacity (h, w).
 
-    The colours (viridis, perceptually uniform) go from the nearest to the farthest distance of the opaque pixels.
+    The colour map (viridis) spans the depths of the opaque pixels.
     """
     depth, acc = np.asarray(depth, np.float64), np.asarray(acc, np.float64)
     opaque = depth[acc > OPAQUE]
@@ -73,12 +73,12 @@ def png(image: np.ndarray | Array) -> bytes:
 
 
 def png_url(image: np.ndarray | Array) -> str:
-    """The image as an address that holds it as PNG, for pages that load nothing."""
+    """The image as a data URL of a PNG, for self-contained pages."""
     return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
 
 
 def check_place(path: Path) -> None:
-    """ValueError if no file can be written at a path: it is asked before the work, not after it."""
+    """ValueError if no file can be written at a path; called before long work."""
     if path.is_dir():
         raise UserError(f"{path}: a folder; expected the name of a file")
     above = next(folder for folder in path.absolute().parents if folder.exists())
@@ -89,14 +89,14 @@ def check_place(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file in one piece; folders that are missing are made."""
+    """Writes a file atomically; makes missing folders."""
     with _in_its_place(path) as unfinished:
         unfinished.write_bytes(data)
 
 
 @contextlib.contextmanager
 def _in_its_place(path: Path) -> Iterator[Path]:
-    """The path beside it where a file is written, which is renamed when that is done, or removed."""
+    """Context with a temporary path beside `path`, renamed to it at the end, or removed after an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
     try:
@@ -107,9 +107,9 @@ def _in_its_place(path: Path) -> Iterator[Path]:
 
 
 def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int) -> tuple[Path, str]:
-    """(file written, reason): an endless .gif, or an .mp4 where imageio-ffmpeg is installed.
+    """(path written, reason): a looping .gif, or an .mp4 if imageio-ffmpeg is installed.
 
-    Without it a .mp4 becomes the .gif of the same name, and the reason says so in one line; else it is empty.
+    Without it, a .gif is written instead of the .mp4, and the reason says so in one line; else the reason is empty.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
@@ -121,7 +121,7 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
         try:
             _write_mp4(path, pictures, fps)
             return path, ""
-        except (ImportError, RuntimeError):  # the latter on a platform that the package brings no program for
+        except (ImportError, RuntimeError):  # the latter on platforms for which the package has no ffmpeg
             reason = "written as .gif: .mp4 needs ffmpeg (pip install imageio-ffmpeg)"
     path = path.with_suffix(".gif")
     write_whole(path, _gif(pictures, fps))
@@ -129,15 +129,15 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
 
 
 def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
-    """A GIF that loops; all frames share one palette, or still surfaces would flicker; the background is exact."""
+    """A looping GIF; all frames share one palette, so that still surfaces do not flicker; the background is exact."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
-    step = max(min(pictures[0].shape[:2]) // PALETTE_PIXELS, 1)  # of 24 frames of 512 pixels whole, 5.9 s
+    step = max(min(pictures[0].shape[:2]) // PALETTE_PIXELS, 1)  # at full size 24 frames of 512 px would take 5.9 s
     strip = Image.fromarray(np.concatenate([pictures[i][::step, ::step] for i in chosen]))
     palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
     background, colors, place = pictures[0][0, 0], palette.getpalette() or [], int(np.asarray(palette)[0, 0])
     palette.putpalette([*colors[: 3 * place], *background.tolist(), *colors[3 * place + 3 :]])
     images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    for image, picture in zip(images, pictures, strict=True):  # Pillow takes any color nearby
+    for image, picture in zip(images, pictures, strict=True):  # Pillow takes any close colour
         image.paste(place, None, Image.fromarray((picture == background).all(axis=-1)))
     milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
     stream = io.BytesIO()
@@ -148,7 +148,7 @@ def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
 
 
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None:
-    """Write H.264 that every player opens, which wants even sides: an odd one loses its last pixel row."""
+    """Writes H.264, which needs even sides: the last row or column of an odd side is cut off."""
     import imageio_ffmpeg
 
     height, width = (size - size % 2 for size in pictures[0].shape[:2])
@@ -156,7 +156,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
         writer = imageio_ffmpeg.write_frames(
             str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
         )
-        with warnings.catch_warnings():  # of JAX: the child starts ffmpeg at once and touches nothing of it
+        with warnings.catch_warnings():  # JAX's warning: the child process executes ffmpeg at once
             warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
             writer.send(None)
         for picture in pictures:
@@ -165,17 +165,17 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
 
 
 def template(path: Path) -> Template:
-    """The template of a page in a file; a name that it uses and is not given is an error."""
+    """The page template in a file; names that are used but not given are errors."""
     files = FileSystemLoader([path.parent, Path(__file__).parent])
     pages = Environment(loader=files, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return pages.get_template(path.name)
 
 
 def read_light(source: Path | str, normalise: bool = True) -> Light:
-    """The light of a map's file, or one of the package: room, studio, sunset, overcast, night.
+    """The light in an environment map's file, or one of the package's: room, studio, sunset, overcast, night.
 
-    Normalised, a white diffuse sphere averages 0.6, as in the data that the networks learnt from; else the radiance is
-    that of the file.  ValueError in one line for what is no such map.
+    Normalised, a white diffuse sphere has a mean of 0.6, as in the training data; else the file's radiance is kept.
+    ValueError, in one line, for anything else.
     """
     named = skies.NAMED.get(str(source))
     envmap = named(skies.HEIGHT) if named else read_envmap(Path(source))
@@ -183,7 +183,7 @@ def read_light(source: Path | str, normalise: bool = True) -> Light:
 
 
 def read_envmap(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """Linear radiance of a latitude-longitude map; ValueError names the file and what is wrong with it."""
+    """Linear radiance of a latitude-longitude map; ValueError names the file and what is wrong."""
     if not path.is_file():
         known = ", ".join(NAMES)
         raise UserError(f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {known}")
@@ -208,7 +208,7 @@ def _read_bitmap(path: Path) -> np.ndarray:
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
     try:
-        with threads(2):  # with a single one the OpenEXR reader waits for itself for ever
+        with threads(2):  # with one thread the OpenEXR reader deadlocks
             bitmap = mi.Bitmap(str(path))
             if bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
                 raise UserError(f"{path}: holds an 8- or 16-bit picture, not radiance; give a real .hdr or .exr")
@@ -220,7 +220,7 @@ def _read_bitmap(path: Path) -> np.ndarray:
 
 @contextlib.contextmanager
 def threads(least: int) -> Iterator[None]:
-    """Let Mitsuba use at least so many threads for a while."""
+    """Context in which Mitsuba uses at least `least` threads."""
     drjit = import_module("drjit")
     before = drjit.thread_count()
     drjit.set_thread_count(max(before, least))

@@ -1,11 +1,10 @@
 """Airborne and terrestrial laser scans (.las, compressed .laz) as named columns, piece by piece, through laspy.
 
-What the header announces is compared with the size of the file before laspy, which takes memory and time for whatever
-is announced, sees it; and lazrs, which unpacks .laz, ends the whole process where a size in the file is too large.  So
-the sizes are walked through before (LASzip specification, LAZ 1.4 R1):
+laspy allocates whatever the header declares, and lazrs, which unpacks .laz, aborts the process if a size in the file
+is too large.  So all sizes are checked against the size of the file first (LASzip specification, LAZ 1.4 R1):
     record 22204 of "laszip encoded"   ... chunk size u32 at 12, number of items u16 at 32, items (type, size, version)
-    at the points' place   i64 place of the chunk table (-1: it stands in the last 8 bytes), then the chunks
-    chunk of layers        first point as it is, u32 number of points, u32 size of each layer, the layers
+    at the offset of the points   i64 offset of the chunk table (-1: in the last 8 bytes), then the chunks
+    chunk of layers        first point uncompressed, u32 number of points, u32 size of each layer, the layers
     chunk table            u32 version, u32 number of chunks
 """
 
@@ -21,25 +20,25 @@ from spnr_jax.formats.assets import extra
 from spnr_jax.formats.columns import Columns, Report, name_columns
 
 RECORD_HEAD, NAME, NUMBER = 54, b"laszip encoded", 22204
-LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of an item of this type; those of extra bytes (14) have one a byte
-CHUNKED_LAYERS = 3  # the compressor of layered points
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of each item type; extra bytes (14) have one per byte
+CHUNKED_LAYERS = 3  # number of the layered compressor
 LARGEST_CHUNK = 2**24  # points; writers use 50,000
-VARIABLE = 2**32 - 1  # chunk size that says that every chunk has its own
+VARIABLE = 2**32 - 1  # chunk size: each chunk has its own
 PIECE_BYTES = 2**23  # of points in memory at a time
 COLUMNS = ("red", "green", "blue", "intensity", "classification", "withheld")
-# places in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts; of version 1.4 counts of records and points
+# offsets in the header (ASPRS LAS 1.4 R15, table 3): sizes and counts; version 1.4's counts of records and points
 SIZES, EVLRS, COUNT_14, SMALLEST_HEADER = 94, 243, 247, 227
-COMPRESSED = 0xC0  # bits of the point format
+COMPRESSED = 0xC0  # flag bits of the point format
 
 
 def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns x y z, the colours, the intensity and the extra bytes of a scan, some points at a time."""
+    """The columns x y z, COLUMNS and extra bytes of a scan, some points at a time."""
     laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
-    backends = (laspy.LazBackend.Lazrs,)  # its parallel reader ends the whole process on a damaged file
+    backends = (laspy.LazBackend.Lazrs,)  # its parallel reader aborts the process on a damaged file
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         try:
             if more := _check_sizes(content):
-                report(f"at least {more:,} points stand behind those that the header announces and are not read")
+                report(f"at least {more:,} points beyond those that the header announces are not read")
         except struct.error:
             raise UserError("is cut off: its header or compressed data ends too early") from None
     try:
@@ -52,14 +51,14 @@ def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
                 yield columns | name_columns({name: np.asarray(points[name]) for name in names})
-    except BaseException as error:  # lazrs, a library in Rust, panics, which is no Exception
+    except BaseException as error:  # a panic in lazrs, a Rust library, is no Exception
         if type(error).__name__ != "PanicException":
             raise
         raise UserError(f"is a broken LAZ file ({error})") from None
 
 
 def _check_sizes(content: mmap.mmap) -> int:
-    """Points behind those announced, at least; ValueError if more than there are is announced, also to lazrs."""
+    """A lower bound of the points beyond the announced ones; ValueError if the file is too small for its sizes."""
     if content[:4] != b"LASF" or len(content) < SMALLEST_HEADER:
         raise UserError("is not a LAS file, or its header is cut off (expected 'LASF' and at least 227 bytes)")
     place, data, records, kind, length, points = struct.unpack_from("<HIIBHI", content, SIZES)
@@ -70,8 +69,8 @@ def _check_sizes(content: mmap.mmap) -> int:
     if not kind & COMPRESSED:
         if not length or data + points * length > len(content):
             raise UserError(f"is cut off: {points} points of {length} bytes are announced in {len(content)} bytes")
-        further = content[25] == 3 or (content[25] > 3 and any(content[EVLRS : EVLRS + 4]))  # other things behind them
-        return 0 if further else (len(content) - data) // length - points
+        followed = content[25] == 3 or (content[25] > 3 and any(content[EVLRS : EVLRS + 4]))  # by other data
+        return 0 if followed else (len(content) - data) // length - points
     for _ in range(records):
         name, number, size = struct.unpack_from("<16sHH", content, place + 2)
         if name.rstrip(b"\0") == NAME and number == NUMBER:
@@ -85,26 +84,26 @@ def _check_sizes(content: mmap.mmap) -> int:
     if layered and compressor != CHUNKED_LAYERS:
         raise UserError(f"is broken: points in layers, and {compressor} as the way in which they are compressed")
     if layered and not chunk_size:
-        chunk_size = VARIABLE  # as writers of COPC put it
+        chunk_size = VARIABLE  # COPC writes 0
     (table,) = struct.unpack_from("<q", content, data)
     if table == -1:
         (table,) = struct.unpack_from("<q", content, len(content) - 8)
     (chunks,) = struct.unpack_from("<4xI", content, max(table, 0))
     most = LARGEST_CHUNK if chunk_size == VARIABLE else chunk_size
-    # each chunk begins with a point as it is
+    # each chunk begins with an uncompressed point
     if sum(size for _, size in items) != length or not 0 < most <= LARGEST_CHUNK or table < 0:
         raise UserError(f"is broken: points of {length} bytes, items {items}, chunks of {chunk_size}, table at {table}")
     if chunks * length > len(content) or chunks * most < points:
         raise UserError(f"is broken: {points} points in {chunks} chunks in {len(content)} bytes")
     place, layers = data + 8, sum(LAYERS.get(kind, size) for kind, size in items)
-    held = 0 if layered or chunk_size == VARIABLE else (chunks - 1) * chunk_size + 1  # the last one may be shorter
+    held = 0 if layered or chunk_size == VARIABLE else (chunks - 1) * chunk_size + 1  # the last chunk may be shorter
     for number in range(chunks if layered else 0):
         count, *sizes = struct.unpack_from(f"<{1 + layers}I", content, place + length)
         place += length + 4 + 4 * layers + sum(sizes)
         held += count
         if place > len(content) or count > LARGEST_CHUNK:
             raise UserError(f"is cut off: a chunk of {count} points ends at byte {place} of {len(content)}")
-        # lazrs would take what stands in the middle of a chunk for the next one
+        # else lazrs would read the next chunk from the middle of this one
         if chunk_size != VARIABLE and not (count == chunk_size or (count < chunk_size and number == chunks - 1)):
             raise UserError(f"is broken: a chunk of {count} points where each has {chunk_size}")
     if layered and held < points:

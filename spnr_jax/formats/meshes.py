@@ -1,10 +1,10 @@
 """Mesh files as assets: read (gltf.py, obj.py, polygons.py), checked, cleaned and merged by material.
 
-checked   indices inside, coordinates finite, an extent above zero
-cleaned   faces without area and vertices without faces removed; normals unit; colours in [0, 1]; unused columns gone
-merged    parts with equal materials (by value) are one part: a renderer compiles per part. Smooth and flat parts stay
-          apart, so that neither takes on the other's normals.
-tinted    a renderer of references takes either a texture or colours at vertices: of colours on a texture their mean
+check     indices in range, finite coordinates, an extent above zero
+clean     remove faces without area, vertices without faces and unused columns; unit normals; colours in [0, 1]
+merge     parts with equal materials become one part, because mitsuba compiles per part; smooth and flat parts stay
+          separate, so that neither gets the other's normals
+tint      for references, where mitsuba takes a texture or vertex colours but not both: the mean colour of the vertices
 """
 
 import hashlib
@@ -26,9 +26,9 @@ from spnr_jax.kernels.triangles import face_crosses, unit, vertex_normals
 
 # Faces below this share of the squared box diagonal are float32 rounding, not surface.
 DEGENERATE_AREA = 1e-14
-ACROSS = 0.5  # median cosine between normals and faces, below which the normals are not those of the faces
-MAX_TEXCOORD = 1e6  # beyond it float32, in which the renderer computes, cannot tell neighbouring texels apart
-WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # columns of a part, one row per vertex
+ACROSS = 0.5  # median cosine between normals and faces, below which the normals are ignored
+MAX_TEXCOORD = 1e6  # beyond it the renderer's float32 cannot resolve neighbouring texels
+WIDTHS = {"positions": 3, "normals": 3, "texcoords": 2, "colors": 3}  # arrays of a part, one row per vertex
 READERS = {".glb": load_gltf, ".gltf": load_gltf, ".obj": load_obj} | PLAIN
 SUFFIXES = tuple(READERS)
 
@@ -38,12 +38,12 @@ def load_mesh(
 ) -> Asset:
     """The object in a mesh file, parts merged by material; `source` names the file and its checksum.
 
-    `root` is the object's folder, which may hold an .obj file's companions above it (default: the file's folder).
-    UserError for a file that cannot be used: unreadable or truncated, without faces or extent, with buffers missing.
-    "refuse", for references, also refuses what is transparent and images and libraries that are missing; "opaque" and
-    "skip", for pictures, say in `notes` what was made of them, leave out faces that are invisible or not finite, and
-    read what the renderer of references does not know: cut-outs, normal maps.
-    `kind` is a suffix to go by instead of the file's.
+    `root`: the object's folder, where an .obj file's companions may be, above the file's folder (default: that folder).
+    `kind`: the format as a suffix, if not the file's own.
+    "refuse", for references: transparent parts and missing images or libraries are errors.  "opaque" and "skip", for
+    pictures: these are replaced and mentioned in `notes`; invisible and non-finite faces are left out; cut-outs and
+    normal maps, which the renderer of references lacks, are read.
+    UserError if the file is unreadable or truncated, has no faces or extent, or lacks buffers.
     """
     path = Path(path)
     kind = kind or path.suffix.lower()
@@ -51,9 +51,9 @@ def load_mesh(
     with (
         refusing("cannot be read, the file is broken or truncated"),
         warnings.catch_warnings(),
-        np.errstate(all="ignore"),  # assemble looks for what is not finite
+        np.errstate(all="ignore"),  # `assemble` checks for what is not finite
     ):
-        # numpy only warns where the text of a file stops being numbers
+        # NumPy only warns about text that is no number
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
@@ -68,7 +68,7 @@ def load_mesh(
 
 
 def assemble(parts: list[Part], loading: Loading) -> list[Part]:
-    """The parts checked, cleaned, merged and, for references, tinted; changes are named in `ignored`."""
+    """The parts checked, cleaned, merged and, for references, tinted; changes are listed in `ignored`."""
     if not parts:
         raise UserError(f"has nothing to draw: {'; '.join(notes)}" if (notes := loading.notes()) else "has no faces")
     parts = parts if loading.strict else _without_false_normals(_visible(parts, loading), loading)
@@ -88,7 +88,7 @@ def assemble(parts: list[Part], loading: Loading) -> list[Part]:
 
 
 def _check_columns(part: Part) -> None:
-    """Refuse a part whose columns do not have one row per vertex, or whose faces name vertices that are not there."""
+    """UserError unless the arrays have one row per vertex and the faces index these."""
     count = len(part.positions)
     for name, width in WIDTHS.items():
         values = getattr(part, name)
@@ -100,7 +100,7 @@ def _check_columns(part: Part) -> None:
 
 
 def _visible(parts: list[Part], loading: Loading) -> list[Part]:
-    """The parts without faces that have a vertex which is not finite, or invisible ones alone; notes count these."""
+    """The parts without faces that have a non-finite vertex or only invisible ones; notes give their number."""
     lost = {"for a vertex that is NaN or infinity": 0, "for the alpha of their vertices, near 0": 0}
     for number, part in enumerate(parts):
         hidden = invisible({"x": part.positions[:, 0]} | ({} if part.alpha is None else {"alpha": part.alpha}))
@@ -115,7 +115,7 @@ def _visible(parts: list[Part], loading: Loading) -> list[Part]:
 
 
 def _without_false_normals(parts: list[Part], loading: Loading) -> list[Part]:
-    """The parts without normals where most lie across their faces, as those of other axes do."""
+    """The parts, without their normals if most of these lie across the faces (written in other axes)."""
     cosines = [np.zeros(0)]
     for part in parts:
         if part.normals is not None:
@@ -129,7 +129,7 @@ def _without_false_normals(parts: list[Part], loading: Loading) -> list[Part]:
 
 
 def _clean_part(part: Part, loading: Loading) -> Part:
-    """The part with just the vertices that its faces use, in their order, and the columns that its material needs."""
+    """The part with the vertices that its faces use, in their order, and the columns that its material needs."""
     used, faces = np.unique(part.faces, return_inverse=True)
     columns: dict[str, Any] = {name: values[used] for name in WIDTHS if (values := getattr(part, name)) is not None}
     part = replace(part, **columns, alpha=None, faces=faces.reshape(-1, 3).astype(np.int64))
@@ -152,7 +152,7 @@ def _clean_part(part: Part, loading: Loading) -> Part:
 
 
 def _unit_normals(part: Part, ignored: set[str]) -> np.ndarray | None:
-    """The part's normals (v, 3) at length 1; one that is zero or not finite becomes the mean of its faces' normals."""
+    """Unit normals (v, 3) of a part; a zero or non-finite one is replaced by the mean of its faces' normals."""
     if part.normals is None:
         return None
     length = np.linalg.norm(part.normals, axis=-1, keepdims=True)
@@ -167,7 +167,7 @@ def _unit_normals(part: Part, ignored: set[str]) -> np.ndarray | None:
 
 
 def _check_colors(part: Part, ignored: set[str]) -> np.ndarray | None:
-    """The part's vertex colours in [0, 1]; None where they are all white."""
+    """The part's vertex colours in [0, 1]; None if all are white."""
     if part.colors is None or (part.colors == 1).all():
         return None
     if not np.isfinite(part.colors).all():
@@ -180,13 +180,13 @@ def _check_colors(part: Part, ignored: set[str]) -> np.ndarray | None:
 
 
 def _identity(material: Material) -> tuple:
-    """Everything that a material says, with digests of its textures."""
+    """A hashable key of a material: its values, and digests of its textures."""
     values = vars(material).values()
     return tuple((x.shape, hashlib.sha256(x.tobytes()).digest()) if isinstance(x, np.ndarray) else x for x in values)
 
 
 def _merge(parts: list[Part]) -> Part:
-    """One part of several that agree in material and in having normals; missing colours are white."""
+    """One part of several with the same material, all or none with normals; missing colours become white."""
     tinted = any(part.colors is not None for part in parts)
     parts = [replace(x, colors=np.ones_like(x.positions)) if tinted and x.colors is None else x for x in parts]
     names = [name for name in WIDTHS if getattr(parts[0], name) is not None]

@@ -1,10 +1,12 @@
-"""Wavefront OBJ + MTL as parts; vertex colours are read as those of points are (columns.py).
+"""Wavefront OBJ + MTL as parts; vertex colours are read like those of points (columns.py).
 
-Kd is linear (as Blender writes it) and counts only without map_Kd (sRGB), for most exporters leave a placeholder beside
-a map; roughness is Pr, else 1 - sqrt(Ns / 1000) by Blender's exporter (its first: 900), else sqrt(2 / (Ns + 2)) where
-there is a highlight (no Ks 0, illum 0 or 1), else 0.5; metallic is Pm, else 0.  Transparent: d below 1, map_d (cut out
-at a half), or Tr strictly between 0 and 1 (writers disagree which end of Tr is the opaque one).  Of faces with the same
-three corners, as ShapeNet has for the two sides, one is kept, that of the material used first.
+base colour   map_Kd (sRGB), else Kd (linear, as Blender writes it): beside a map, Kd is a placeholder in most files
+roughness     Pr; else 1 - sqrt(Ns / 1000) from Blender's exporter (900 from its older one); else sqrt(2 / (Ns + 2)) if
+              there is a highlight (not with Ks 0, or illum 0 or 1); else 0.5
+metallic      Pm, else 0
+transparent   d below 1; map_d, cut out at 0.5; Tr strictly between 0 and 1 (writers disagree which end is opaque)
+
+Of faces with the same three corners, which ShapeNet has for the two sides, the one with the first material is kept.
 """
 
 import re
@@ -25,20 +27,20 @@ from spnr_jax.kernels.triangles import triangulate
 
 Rests = dict[str, list]
 Move = tuple[tuple[float, float], tuple[float, float]]  # scale and offset of texture coordinates
-Look = tuple[Material | None, Move]  # a principled material, None where it is nowhere to be seen
+Look = tuple[Material | None, Move]  # None for a material that is invisible everywhere
 UNMOVED: Move = (1.0, 1.0), (0.0, 0.0)
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
-NEARLY_GREY = 16  # of 255: between the channels of a grey JPEG
+NEARLY_GREY = 16  # of 255: largest difference between the channels of a grey JPEG
 READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
-SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # the older lighting model: has no principled counterpart
-SHININESS = re.compile(r"\s*# Blender( MTL)?")  # of an MTL by Blender: Ns is 1000 (1 - roughness)^2, once 900
+SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # Phong parameters without a principled counterpart
+SHININESS = re.compile(r"\s*# Blender( MTL)?")  # Blender: Ns = 1000 (1 - roughness)^2, formerly 900
 OPTION = re.compile(
     r"-(\w+)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+"
 )
 
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
-    """The file's faces grouped by material, as they lie in the file."""
+    """The file's faces grouped by material."""
     with open_text(path) as file:
         text = _parse(file.read())
     if not (text["f sizes"] or text["v"]):
@@ -61,7 +63,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         look, move = _look(name, library.get(name), loading) if name else (make_material(), UNMOVED)
         if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
-            look = replace(look, base_color=np.ones(3, np.float32))  # a placeholder
+            look = replace(look, base_color=np.ones(3, np.float32))  # Kd is a placeholder
         elif colors is not None and look is not None:
             loading.say("colours of the vertices multiply those of the material", about=repr(name))
         looks[name] = look, move
@@ -76,14 +78,14 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 
 def _parse(content: str) -> Rests:
-    """The rests of lines by their keyword; of faces all corners, words like 1/2/3 from 1, sizes and materials."""
+    """Lines by keyword, without it; faces as all corners (words like 1/2/3, from 1), sizes and materials."""
     found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf")}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     for line in content.replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword == "f":
             words = rest.partition("#")[0].split()
-            if "-" in rest:  # numbers that count back from here
+            if "-" in rest:  # relative indices
                 pairs = [zip(word.split("/"), counted, strict=False) for word in words]
                 words = ["/".join(str(int(n) + len(x) + 1) if n[:1] == "-" else n for n, x in pair) for pair in pairs]
             found["f"].extend(words)
@@ -97,14 +99,14 @@ def _parse(content: str) -> Rests:
 
 
 def _table(rows: list[str], width: int | None) -> np.ndarray:
-    """The first numbers (rows, width) of each row, all if there is no width."""
+    """The first `width` numbers of each row, or all: (rows, width)."""
     columns = None if width is None else range(width)
     plain = [UNDEFINED.sub("nan", row) if "n" in row or "#" in row else row for row in rows]
     return np.loadtxt(plain, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
 
 
 def _columns(text: Rests, loading: Loading) -> Columns:
-    """The columns of the vertices: positions, and perhaps colours, white where only some have one (as of Blender)."""
+    """Columns of the vertices: positions and, if present, colours; white where only some have one (Blender)."""
     try:
         table = _table(text["v"], None)
     except ValueError as error:
@@ -127,7 +129,7 @@ def _columns(text: Rests, loading: Loading) -> Columns:
 def _parts(
     text: Rests, positions: np.ndarray, colors: np.ndarray | None, looks: dict[str, Look], loading: Loading
 ) -> list[Part]:
-    """The faces of each material that is to be seen, apart also by whether they have texture coordinates or normals."""
+    """The faces of each visible material, split by whether they have texture coordinates and normals."""
     numbers = {word: i for i, word in enumerate(dict.fromkeys(text["f"]))}
     corners = np.array([[int(n or 0) for n in f"{word}//".split("/")[:3]] for word in numbers])  # of vertices
     if corners.min() < 0 or corners[:, 0].min() < 1:
@@ -137,11 +139,11 @@ def _parts(
             raise UserError(f"has faces that name {keyword} {last} of {count}: broken file")
     of_v, of_vt, of_vn = corners.T - 1
     positions, colors = positions[of_v], None if colors is None else colors[of_v]
-    texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2)[of_vt]  # one number is that along a line
+    texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2)[of_vt]  # a 1-D coordinate gets v = 0
     normals = _table([*text["vn"], "0 0 0"], 3)[of_vn]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
     number = {name: i for i, name in enumerate(looks)}
-    has = (corners[faces] > 0).all(axis=1)  # whether each face has places, texture coordinates, normals
+    has = (corners[faces] > 0).all(axis=1)  # (f, 3): positions, texture coordinates, normals
     kind = 4 * np.array([number[name] for name in text["usemtl"]])[owner] + 2 * has[:, 1] + has[:, 2]
     shown = np.array([look is not None for look, _ in looks.values()])
     order = np.argsort(kind, kind="stable")
@@ -152,7 +154,7 @@ def _parts(
 
     @cache
     def moved(move: Move) -> np.ndarray:
-        return (texcoords * move[0] + move[1]) * [1, -1] + [0, 1]  # v is from the lower edge
+        return (texcoords * move[0] + move[1]) * [1, -1] + [0, 1]  # OBJ's v is from the lower edge
 
     parts, faces, kind = [], faces[order[first]], kind[order[first]]
     for code in np.unique(kind):
@@ -165,7 +167,7 @@ def _parts(
 
 
 def _first_of_doubles(corners: np.ndarray) -> np.ndarray:
-    """Mask (f,) of the triangles (f, 3, 3) whose three corners no earlier one has in some order."""
+    """Mask (f,) of the triangles (f, 3, 3) whose corners are not, in any order, those of an earlier one."""
     order = np.lexsort(np.moveaxis(corners, -1, 0)[::-1], axis=-1)
     rows = np.take_along_axis(corners, order[..., None], axis=1).reshape(-1, 9)
     mask = np.zeros(len(corners), bool)
@@ -179,7 +181,7 @@ def _first_of_doubles(corners: np.ndarray) -> np.ndarray:
 def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     """Statements of an MTL file: material name -> keyword in lower case -> rest of the line.
 
-    Of Blender's also `blender`, the Ns of its least roughness.
+    Files of Blender also get `blender`: the Ns of roughness 0.
     """
     library: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
@@ -198,12 +200,12 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
 
 
 def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
-    """The look of an MTL entry; its texture coordinates are moved as those of its first map."""
+    """The look of an MTL entry; texture coordinates are transformed as for its first map."""
     ignored = loading.ignored
     if entry is None:
         loading.go_on_without("uses a material that no library defines", repr(name))
         return make_material(), UNMOVED
-    if loading.strict:  # that it is transparent is a plainer reason than a missing file
+    if loading.strict:  # transparency is a clearer error than a missing file
         loading.cut_out(name, make_material(), *_alpha(entry, None))
     maps: dict[str, np.ndarray] = {}
     move = UNMOVED
@@ -244,18 +246,18 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
     return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d"))), move
 
 
-def _pair(words: Sequence[str], plain: float) -> tuple[float, float]:
-    """The first two numbers of a map's option; plain ones where it has fewer."""
-    one, two, *_ = (*(float(word) for word in words if not word.isalpha()), plain, plain)
+def _pair(words: Sequence[str], default: float) -> tuple[float, float]:
+    """The first two numbers of a map's option, or the default."""
+    one, two, *_ = (*(float(word) for word in words if not word.isalpha()), default, default)
     return one, two
 
 
 def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> tuple[str, np.ndarray, float | int | None]:
-    """Why an MTL entry is said to be transparent ("": it is not), its alpha () or (h, w), and the cut-off of a mask."""
+    """The statement that makes an entry transparent ("": opaque), its alpha () or (h, w), and a mask's cut-off."""
     if "map_d" in entry:
         if map_d is None:
             return "map_d", np.ones(()), assets.MOSTLY_OPAQUE
-        # a grey picture, or the alpha of another, which is opaque where it has none
+        # a grey picture is the alpha itself; of a coloured one its alpha channel
         own = entry["map_d"] != entry.get("map_kd") and np.ptp(map_d[..., :3], axis=-1).max() <= NEARLY_GREY
         alpha = map_d[..., 0 if own and map_d[..., 3].min() == 255 else 3]
         return "map_d", decode_texels(alpha), assets.MOSTLY_OPAQUE

@@ -1,20 +1,19 @@
-"""Which way is up in a file of points, and where the sensor stood that saw them.
+"""The up axis of a point file, and the position of the sensor that scanned it.
 
-glTF is y up and laser scans (.las) are z up by definition.  Of other files y or z is chosen, whichever has the larger
+glTF is y up and laser scans (.las) are z up by definition.  For other files, y or z is chosen by the larger
 (base + level) / 2 + unlike - crowd:
 
-base     it stands on a broad base: the larger convex hull of the points within BASE of either end of the axis, over
-         that of all points seen along the axis
-level    it has level surfaces: the share of the points whose normal is nearly that of the axis
-unlike   it ends differently above: how far the points, upside down, lie from the points, over UNLIKE, at most 1
-crowd    it does not end in a panel: the larger share of the points within BASE of either end
+base     a broad base: area of the convex hull of the points within BASE of an end of the axis (the larger one), over
+         that of all points, projected along the axis
+level    level surfaces: share of the points whose normal is nearly parallel to the axis
+unlike   different ends: mean distance of the points, turned upside down, from the points, over UNLIKE, at most 1
+crowd    no panel at an end: share of the points within BASE of either end (the larger one)
 
-Of 78 real objects 72 are found upright as they are and 71 turned to z up (docs/lab/readers.md); for the others there is
-`--up`.
+72 of 78 real objects are found upright as they are, and 71 turned to z up (docs/lab/readers.md); `--up` overrides it.
 
-PCD headers and PLY camera elements name the place of a sensor, to which normals point; a camera's axes say which way is
-up.  The place 0 0 0 that writers of PCD put there for want of a better one is believed if nothing hides the points from
-it, another place if it sees most of them.
+PCD headers and PLY camera elements may give the position of a sensor; normals are turned towards it, and a camera's
+axes give the up axis.  PCD writers put 0 0 0 if it is unknown: that is used only if it sees nearly all points, another
+position if it sees most of them.
 """
 
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from spnr_jax.formats.row_files import element_pieces, read_header
 from spnr_jax.surfels.normals import estimate_normals, find_visible, measure_spacing
 
-ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes it y
+ROTATIONS = {  # up axis of the file -> rotation (rows) that maps it to y
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
     "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
@@ -37,19 +36,19 @@ ROTATIONS = {  # axis of the file that points up -> rotation (rows) that makes i
 }
 BY_FORMAT = {".glb": "y", ".gltf": "y", ".las": "z", ".laz": "z"}
 BASE, UNLIKE = 0.02, 0.03  # of the largest extent
-LEVEL = 0.99  # least cosine between the normal of a level surface and the axis
-MARGIN = 0.02  # by which z must stand better: what stands equally is y up
-MOST_STANDING = 2048  # points that tell how an object stands
-AHEAD = 0.5  # least cosine between the z axis of a depth camera and the way to what it sees
-MOST = 0.7  # share of the points that must be seen from a place that a file names; of few points of a ball 0.61 are
-OPEN = 0.9  # share of the points that is seen from where they were scanned; of a whole object it is a half
-BEHIND = 5.0  # spacings behind the first of a pixel that count as seen: noise, and surfaces seen at an angle
-FARTHEST = 1e30  # units, beyond which no sensor and no point lies: galaxies are 1e21 metres wide
+LEVEL = 0.99  # cosine of a level surface's normal to the axis
+MARGIN = 0.02  # by which z must score higher than y
+MOST_STANDING = 2048  # points from which the up axis is estimated
+AHEAD = 0.5  # cosine between a depth camera's z axis and the direction to its points
+MOST = 0.7  # share of the points that must be visible from a file's sensor position (0.61 for a sparse ball)
+OPEN = 0.9  # share of the points that is visible from their scanner; half of a whole object is
+BEHIND = 5.0  # spacings behind the first point of a pixel that count as visible: noise, grazing angles
+FARTHEST = 1e30  # units: largest plausible coordinate (galaxies are 1e21 metres wide)
 PLACE, UP = ("view_px", "view_py", "view_pz"), ("y_axisx", "y_axisy", "y_axisz")  # of VCGLIB's element `camera`
 
 
 def find_up(positions: np.ndarray, kind: str, *, of_splats: bool = False) -> tuple[str, str]:
-    """(up axis, how it was found) of points (n, 3) from a file of a kind; splats of a .ply have y down."""
+    """(up axis, reason) for points (n, 3) from a file of a kind; splats of a .ply have y down."""
     if kind in BY_FORMAT:
         return BY_FORMAT[kind], f"by the format {kind}"
     positions = positions[:: -(-len(positions) // MOST_STANDING)]
@@ -61,7 +60,7 @@ def find_up(positions: np.ndarray, kind: str, *, of_splats: bool = False) -> tup
 
 
 def holds_splats(path: Path, kind: str) -> bool:
-    """Whether it is a .ply of Gaussian splats: their tools write axes right, down, forward."""
+    """Whether it is a .ply of Gaussian splats, whose axes are right, down, forward."""
     if kind != ".ply":
         return False
     with path.open("rb") as file:
@@ -70,7 +69,7 @@ def holds_splats(path: Path, kind: str) -> bool:
 
 
 def standing(positions: np.ndarray, normals: np.ndarray, axis: int) -> float:
-    """How much points (n, 3) with unit normals look like an object that stands along an axis."""
+    """The score of an axis as the up axis of points (n, 3) with unit normals."""
     height, seen, extent = positions[:, axis], np.delete(positions, axis, axis=1), np.ptp(positions, axis=0).max()
     whole = _area(seen)
     if not whole > 0:
@@ -85,7 +84,7 @@ def standing(positions: np.ndarray, normals: np.ndarray, axis: int) -> float:
 
 
 def _area(points: np.ndarray) -> float:
-    """Area of the convex hull of points (n, 2), 0 where there is none."""
+    """Area of the convex hull of points (n, 2); 0 if they lie on a line."""
     try:
         return ConvexHull(points).volume if len(points) > 2 else 0.0
     except QhullError:  # all on one line
@@ -93,14 +92,14 @@ def _area(points: np.ndarray) -> float:
 
 
 class Sensor(NamedTuple):
-    """The place (3,) of a sensor in the file's frame, and the axis that is up for its camera, where it is known."""
+    """Position (3,) of a sensor in the file's frame, and the up axis of its camera, if known."""
 
     place: np.ndarray
     up: str | None = None
 
 
 def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
-    """The sensor of a file of these points (n, 3) or faces; ValueError for a header that cannot be read."""
+    """The sensor of a file with these points (n, 3); ValueError for a header that cannot be read."""
     if kind == ".ply":
         return _camera_of(path)
     if kind != ".pcd":
@@ -111,7 +110,7 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
         return None
     place = np.array(header.sensor)
     if header.organised or _from_there(positions, place, OPEN):
-        # a depth image is in its camera's axes, which are y down looking along z or y up looking against it
+        # a depth image is in its camera's axes: y down, looking along z; or y up, looking along -z
         way = np.median(positions - place, axis=0)
         ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
         return Sensor(place, None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y")
@@ -123,7 +122,7 @@ def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[st
 
 
 def _camera_of(path: Path) -> Sensor | None:
-    """The camera that a PLY file begins with."""
+    """The camera in the first element of a PLY file."""
     with path.open("rb") as file:
         header = read_header(file, ".ply")
         if [name for name, _, _ in header.elements][:1] != ["camera"]:
@@ -138,7 +137,7 @@ def _camera_of(path: Path) -> Sensor | None:
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:
-    """Whether that share of the points is seen from a place; `within` if one inside of their bounding box counts."""
+    """Whether that share of the points is visible from a position; `within`: the answer inside their bounding box."""
     if np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0))):
         return within
     return bool(find_visible(positions, place, measure_spacing(positions), BEHIND).mean() > share)

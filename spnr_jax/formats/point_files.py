@@ -1,10 +1,10 @@
-"""Files opened: which kind a file is, by its first bytes where they tell, and its points as named columns.
+"""The kind of a file, by its first bytes if they tell, else by its suffix; and its points as named columns.
 
-READERS says which module reads which kind: points from row_files.py (.ply .pcd), point_tables.py (text, .npz
-.npy), las.py and gaussian_files.py; meshes (meshes.py) are read as points where they have no faces.
+READERS maps each kind to its reader, in row_files.py (.ply .pcd), point_tables.py (text, .npz .npy), las.py or
+gaussian_files.py.  Meshes (meshes.py) without faces are read as points.
 
-A reader yields pieces of at most some ten megabytes (archives, meshes and compressed files come whole), so that a file
-may be larger than the memory.  Columns have the names and types of the file; columns.py says what they mean.
+A reader yields pieces of some ten megabytes, so that a file may be larger than the memory; archives, meshes and
+compressed files come in one piece.  Columns have the names and types of the file; columns.py interprets them.
 """
 
 import io
@@ -32,7 +32,7 @@ READERS: dict[str, Callable[[Path, Report], Iterator[Columns]]] = {
 MESHES = (".glb", ".gltf", ".obj", ".stl", ".off")
 KNOWN = (*READERS, *MESHES)
 NUMBER, BLANK = rb"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", rb"(?i)(\s|#[^\n\r]*[\n\r])*"
-# how a file begins, and the kind that this tells: of several the one that its own suffix names, else the first
+# first bytes of a file, and its possible kinds: the one of its suffix if that is among them, else the first
 MAGIC = (
     (rb"ply", (".ply",)),
     (rb"glTF", (".glb",)),
@@ -51,9 +51,10 @@ TEXTS = (
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
 ARRAYS = "save its points in Python with np.savez(file, points=..., colors=...)"
-REAL = rb"[-+.\deE]+[ \t]*"  # columns and rows of the scan, four rows of three numbers, then of four
+REAL = rb"[-+.\deE]+[ \t]*"
+# columns and rows of the scan, four rows of three numbers, then of four
 PTX_HEAD = rb"(?:\d+\s*\n){2}(?:(?:" + REAL + rb"){3}\r?\n){4}(?:" + REAL + rb"){4}\r?\n"
-# what is not read: its name if not that of the suffix, suffixes, how it begins (groups: its version), how to convert it
+# formats that are not read: name (default: the suffix), suffixes, first bytes (groups: version), how to convert
 FOREIGN = (
     ("USD (binary crate)", "", rb"PXR-USDC(.)(.)(.)", BLENDER),
     ("USD (text)", "", rb"#usda ([\d.]+)", BLENDER),
@@ -84,9 +85,9 @@ FOREIGN = (
 
 
 def kind_of(path: Path) -> str:
-    """The suffix that names how a file is read, by its first bytes, else its name; ValueError for what cannot be read.
+    """The kind of a file, written as a suffix: by its first bytes, else by its name.
 
-    The error names the format, its version and how to convert it.
+    ValueError for files that cannot be read names the format, its version and how to convert it.
     """
     suffix, known = path.suffix.lower(), f"one of {' '.join(KNOWN)}"
     if path.is_dir():
@@ -116,13 +117,13 @@ def kind_of(path: Path) -> str:
 
 
 def _told_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suffix: str) -> str:
-    """The kind that the first bytes of a file tell; empty if they tell none."""
+    """The kind of a file by its first bytes; empty if they do not tell."""
     kinds = next((kinds for sign, kinds in signs if re.match(sign, head)), ("",))
     return suffix if suffix in kinds else kinds[0]
 
 
 def column_pieces(path: Path, kind: str, report: Report) -> Iterator[Columns] | None:
-    """The columns of a file of points, some points at a time; None for a mesh; `kind` as kind_of says."""
+    """The columns of a point file, some points at a time; None for a mesh; `kind` from `kind_of`."""
     if kind == ".ply":
         with path.open("rb") as file:
             if read_header(file, kind).faces:

@@ -1,12 +1,12 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
-Numbers of text are separated by commas, semicolons, bars or blanks, also behind the last one; a decimal comma is told
-by that nothing else separates there, or by quotes.  Lines of one whole number count the points.  A header line names
-the columns, also behind #, % or //; one without a name is an index, one of words is not read.  Without a header the
-values tell what stands behind x y z: normals, r g b, alpha, roughness, metallic, intensity, or any other number.
+Text is separated by commas, semicolons, bars or blanks, with or without one at the end of a line.  A comma is a decimal
+one if something else separates the numbers, or inside quotes.  Lines of a single integer are counts of points.  A
+header line, also one after #, % or //, names the columns; columns without a name, and columns of words, are not read.
+Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 
-    .npz    arrays (points, c) or (points,), whose names are those of columns; of the points as in text without a header
-    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns) as in text
+    .npz    named arrays (points, c) or (points,); an array of positions may have more columns, as in text
+    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns), as in text
 
 Pickled objects, which could run code, are refused.
 """
@@ -38,33 +38,33 @@ from spnr_jax.formats.columns import (
     plain_name,
 )
 
-Line = tuple[int, str]  # its number in the file, from 1, and its text
+Line = tuple[int, str]  # line number in the file, from 1, and text
 
 COLOR = ("r", "g", "b")
-OPAQUE = (1, 255, 65535)  # what an alpha is where nobody thought of it
-NUMBERS = "fiu"  # kinds of types that hold real numbers
-UNIT_LENGTH = 0.02  # how far from 1 the length of a normal may be
+OPAQUE = (1, 255, 65535)  # usual constant values of alpha
+NUMBERS = "fiu"  # dtype kinds of real numbers
+UNIT_LENGTH = 0.02  # tolerance of the length of a normal
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of sRGB (BT.601)
-CLOSE = 0.15  # correlations this far apart do not tell which columns are the colours
-SINGLE = 4  # numbers of an array that is one value for all points, or none
-PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text and of an array in memory at a time
-SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line that an error shows, and in which names are looked for
-MOST_LINES, MOST_COLUMNS = 99, 16  # before the numbers, in which names are looked for; of a table without names
+CLOSE = 0.15  # difference of correlations below which the choice of colour columns is reported as ambiguous
+SINGLE = 4  # an array of at most so many numbers does not belong to the points
+PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text, and of an array, in memory at a time
+SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line shown in errors, and searched for names
+MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names; columns of an unnamed table
 COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
-COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # of points, and perhaps of columns
+COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
-EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a number that was not known
-UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of Windows, of databases
-UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # no numbers: CloudCompare's roughness has a radius
-INDEX = "index"  # the name of a column that only counts
-MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can announce any number
-PARSER = threading.Lock()  # Python's, which NumPy reads headers with, fails in two threads at once (gh-106905)
-UNNAMED = tuple(f"arr{i}" for i in range(9))  # names by np.savez of arrays that were given none
+EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a missing number
+UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
+UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
+INDEX = "index"  # name of a column that is not used
+MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can declare any size
+PARSER = threading.Lock()  # ast.literal_eval, which NumPy reads headers with, is not thread-safe (gh-106905)
+UNNAMED = tuple(f"arr{i}" for i in range(9))  # np.savez's names of arrays passed without one
 
 
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns of a text file, some points at a time; a line before the numbers may name them."""
+    """The columns of a text file, some points at a time; a line above the numbers may name them."""
     with open_text(path) as file:
         numbered = ((number, _unquote(line.strip().replace("|", ";"))) for number, line in enumerate(file, 1))
         before, first = _split_header(numbered)
@@ -75,7 +75,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         parts = first[1].split()
         if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
             delimiter = None  # these are decimal commas
-        headers = {line for line in before if not NUMBER.match(line)}  # come again where files were joined
+        headers = {line for line in before if not NUMBER.match(line)}  # repeated where files were concatenated
         announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
 
         def rows_of_numbers() -> Iterator[Line]:
@@ -112,19 +112,19 @@ def open_text(path: Path) -> TextIO:
 
 
 def encoding_of(head: bytes) -> str:
-    """The encoding of text that begins so."""
+    """The encoding of text with these first bytes."""
     if 0 in head[:2]:
         return "utf-16-le" if head[0] else "utf-16-be"
     return "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
 def _unquote(text: str) -> str:
-    """A line without quotes; a comma inside of them is a decimal one."""
+    """The line without quotes; commas inside quotes are decimal ones."""
     return re.sub('"([^"]*)"?', lambda found: found[1].replace(",", "."), text) if '"' in text else text
 
 
 def _words(line: str) -> list[str]:
-    """The fields of a line, between the separators that it has."""
+    """The fields of a line."""
     mark = next((mark for mark in ";," if mark in line), None)
     return [word.strip("' \t") for word in (line.split(mark) if mark or "\t" not in line else re.split(r"\t+", line))]
 
@@ -134,13 +134,13 @@ def _is_number(word: str) -> bool:
 
 
 def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
-    """The last lines before the rows of numbers, and the first row (0, "" if there is none)."""
+    """The last lines above the rows of numbers, and the first row ((0, "") if there is none)."""
     before: deque[str] = deque(maxlen=MOST_LINES)
     for number, line in lines:
         words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
-        numbered = words == list(map(str, range(len(words))))  # as pandas names an array's columns
+        numbered = words == list(map(str, range(len(words))))  # pandas' names of unnamed columns
         fields, above = ([*map(_is_number, _words(text))] for text in (line[:LONGEST_HEADER], ["", *before][-1]))
-        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # perhaps behind a word
+        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # the row may begin with a word
         if (NUMBER.fullmatch(words[0]) or below_names) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
             return [*before], (number, line)
         before.append(line[:LONGEST_HEADER])
@@ -148,9 +148,9 @@ def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
 
 
 def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
-    """Numbers of numbered rows of `count` numbers; ValueError names the first, a `what`, that holds others.
+    """The numbers of rows of `count` numbers each; missing ones are NaN.
 
-    Undefined numbers of every kind are NaN.
+    ValueError gives the number of the first row with other content; `what` is the word for a row.
     """
 
     def load(texts: list[str]) -> np.ndarray:
@@ -174,14 +174,14 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
 
 
 def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
-    """Names of the columns of a table by a line before it that names places, else by the numbers."""
+    """Column names of a table: from a line above it that names positions, else from the values."""
     count, filled = table.shape[1], 1 + int(np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2))
     found: list[list[str]] = []
     unfit: list[str] = []
     for line in reversed(before):
         text = UNITS.sub("", line.lstrip("#/% "))
         names = [name.lower() for name in _words(text)]
-        if "\t" in text and not filled <= len(names) <= count:  # some of the tabs are blanks
+        if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks
             names = text.lower().split()
         while len(names) > filled and not names[-1]:
             names.pop()
@@ -191,22 +191,22 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
         elif "x" in names and not is_remark:
             unfit = unfit or names
     if names := next(filter(name_places, found), [*found, []][0]):
-        names += [""] * (count - len(names))  # separators behind the last number
+        names += [""] * (count - len(names))  # separators at the end of the line
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
-    if len(unfit) == count - 1 and len(table) > 1 and (np.diff(table[:, 0]) == 1).all():  # as R writes a table
+    if len(unfit) == count - 1 and len(table) > 1 and (np.diff(table[:, 0]) == 1).all():  # R: unnamed row numbers
         return (INDEX, *unfit)
     if unfit:
         hint = "; decimal commas need another separator" if count == 2 * len(unfit) else ""
         raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers{hint}")
     of_format = suffix == ".pts" and filled == 7
-    told = (*"xyz", "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
-    return (*told, *[INDEX] * (count - filled))
+    guessed = (*"xyz", "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
+    return (*guessed, *[INDEX] * (count - filled))
 
 
 def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
-    """Names of the columns of a table (points, columns) that has none: what stands behind x y z is told by its values.
+    """Guessed names of the columns of a table (points, columns) by their values; the first three are x y z.
 
-    The first three that can be normals; of the others those three that are most alike of what can be colours.
+    Normals are the first three columns that can be; colours the three most correlated ones that can be.
     """
     count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
     if count < 3 or count > MOST_COLUMNS:
@@ -217,9 +217,9 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
     timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
     whole = (table % 1 == 0).all(axis=0)
-    pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # by row and column
+    pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # pixels: row and column first
     first = 2 if pictured else int(timed or np.all(steps == 1))
-    if first and count - first != 5:  # x, then y z r g b, is a profile
+    if first and count - first != 5:  # five columns after it: x of a profile, then y z r g b
         report(
             f"columns before x y z, which number or time the points: {first} (if not, name the columns in a first line)"
         )
@@ -250,14 +250,14 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
 
 
 def _are_normals(vectors: np.ndarray, positions: np.ndarray) -> bool:
-    """Whether vectors (n, 3) have length 1, up to rounding, and are not just colours: some below 0, or a plane's."""
+    """Whether vectors (n, 3) have unit length and are not colours: some are negative, or all normal to a plane."""
     lengths = np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
     plane = np.ptp(vectors, axis=0).max() == 0 and np.ptp(positions @ vectors[0]) < UNIT_LENGTH * np.ptp(positions)
     return bool(((vectors < 0).any() or plane) and np.median(np.abs(lengths - 1)) < UNIT_LENGTH)
 
 
 def _are_colors(values: np.ndarray) -> bool:
-    """Whether values (n, 3) are 0 to 1, or whole ones of at most 16 bits, and no channel outshines the others."""
+    """Whether values (n, 3) are 0 to 1, or integers of at most 16 bits, with channels of similar range."""
     highest = values.max(axis=0)
     whole = highest.max() <= OPAQUE[-1] and np.all(values % 1 == 0)
     return bool(values.min() >= 0 and highest.min() >= highest.max() / 16 and (whole or highest.max() <= 1))
@@ -265,9 +265,9 @@ def _are_colors(values: np.ndarray) -> bool:
 
 @np.errstate(invalid="ignore")  # of a constant column
 def _likeness(table: np.ndarray, start: int) -> float:
-    """The smaller correlation of neighbouring columns of the three from `start`; 0 where one is constant.
+    """The smaller correlation of neighbouring columns among the three from `start`; 0 if one is constant.
 
-    Above any correlation where a column beside them is their luminance.
+    2 if a column beside them is their luminance.
     """
     values = np.asarray(table[:, start : start + 3], np.float64)
     luminance, rounding = values @ LUMINANCE, 1.5 if values.max() > 2 else 0.006
@@ -282,7 +282,7 @@ def _likeness(table: np.ndarray, start: int) -> float:
 
 
 def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns of an array, some points at a time, or of an archive."""
+    """The columns of an array (.npy), some points at a time, or of an archive (.npz)."""
     with path.open("rb") as file:
         magic = file.read(6)
         file.seek(0)
@@ -298,7 +298,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
     try:
         with _parsing(broken):
             rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
-    except MemoryError:  # of Python's parser: the header is nested too deeply
+    except MemoryError:  # the header is nested too deeply for Python's parser
         raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
@@ -314,7 +314,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
 
 
 def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
-    """A table with one row for each point: maps (h, w, c) of pictures, and tables (c, points), become (points, c)."""
+    """A table (points, c) of a table (points, c) or (c, points) or a point map (h, w, c)."""
     if array.ndim == 3 and min(array.shape[:2]) > 1:
         report(f"an array of {' x '.join(map(str, array.shape))} taken as one cloud; of a batch, save array[0] alone")
     table = array.reshape(-1, array.shape[2]) if array.ndim == 3 else array
@@ -326,14 +326,14 @@ def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
 
 @contextlib.contextmanager
 def _parsing(broken: str) -> Iterator[None]:
-    """NumPy reads a file: in one thread at a time, without warnings of old headers; UserError if it is broken."""
+    """Context for NumPy to read a file: one thread at a time, no warnings about old headers; UserError if broken."""
     with refusing(broken), PARSER, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
-    """An .npz archive of arrays by their names."""
+    """The bytes of an .npz archive of named arrays."""
     stream = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
@@ -342,7 +342,7 @@ def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> b
 def read_arrays(
     file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
 ) -> dict[str, np.ndarray]:
-    """The wanted arrays of an .npz archive, a line about others; ValueError if broken, or if it unpacks to too much."""
+    """The wanted arrays of an .npz archive; reports the others; ValueError if it is broken or unpacks to too much."""
     with _parsing("is a broken or truncated NumPy file"), np.load(file, allow_pickle=False) as archive:
         names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
@@ -350,7 +350,7 @@ def read_arrays(
             raise UserError(f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces")
         try:
             arrays = {name: np.asarray(archive[name]) for name in names}
-        except MemoryError:  # a header can announce any number
+        except MemoryError:  # a header can declare any size
             raise UserError("announces more than fits into the memory") from None
     if others := [name for name in sizes if name not in names]:
         report(f"arrays that are not used: {list_names(others)}")
@@ -360,7 +360,7 @@ def read_arrays(
 
 
 def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
-    """The columns of arrays (points, c), or (points,) for scalars; of those without a name all that are as long."""
+    """The columns of named arrays (points, c) or (points,), and of unnamed ones that are as long."""
     columns: Columns = {}
     if name := next((name for name in (*PLACES.split(), "arr0") if name in arrays), None):
         table = np.atleast_2d(arrays.pop(name))

@@ -1,9 +1,9 @@
-"""PLY, STL and OFF files of triangles and polygons as parts, with colours of vertices or faces, or a PLY's textures.
+"""PLY, STL and OFF files of polygons as parts, with colours of vertices or faces, or a PLY's textures.
 
-.ply    elements vertex, and face or tristrips; colours by any of the names that those of points may have; comments
-        `TextureFile name` with a list `texcoord` of each face, or s t or u v of the vertices (MeshLab, OpenMVS)
-.stl    text: three lines `vertex x y z` a triangle; binary: 80 bytes, a count u32, 50 bytes a triangle.  The size of
-        the file counts where the count is 0
+.ply    elements vertex, and face or tristrips; colours under the names of columns.py; comments `TextureFile name` with
+        a list `texcoord` per face, or s t or u v per vertex (MeshLab, OpenMVS)
+.stl    text: three lines `vertex x y z` per triangle; binary: 80 bytes, a count u32, 50 bytes per triangle; a count of
+        0 means as many as fit
 .off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
 """
 
@@ -27,7 +27,7 @@ OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
-    """The part of a PLY file with faces, or strips of them."""
+    """The parts of a PLY file with faces or triangle strips."""
     file = io.BytesIO(path.read_bytes())
     header = read_header(file, ".ply")
     if (element := header.faces) is None:
@@ -51,12 +51,12 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
 
 
 def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray | None:
-    """Texture coordinates (corners, 2) of a PLY file's faces or vertices, None without; v from the lower edge."""
+    """Texture coordinates (corners, 2) of a PLY file's faces or vertices, or None; v is from the lower edge."""
     known = [np.asarray(vertices[name]) for pair in TEXCOORDS if set(pair) <= vertices.keys() for name in pair]
     of_faces, values = lists.get("texcoord", (np.zeros(0), np.zeros(0)))
     if np.array_equal(of_faces, 2 * sizes):
         return values.reshape(-1, 2)
-    inside = len(corners) and corners.min() >= 0 and corners.max() < len(vertices["x"])  # else the file is refused
+    inside = len(corners) and corners.min() >= 0 and corners.max() < len(vertices["x"])  # else it is refused later
     return np.stack(known[:2], axis=-1)[corners] if known and inside else None
 
 
@@ -68,9 +68,9 @@ def _textured(
     number: np.ndarray | None,
     images: list,
 ) -> list[Part]:
-    """A part for each image of polygons of so many corners, each with its own texture coordinates (corners, 2).
+    """One part per image, of polygons with `sizes` corners each; texture coordinates (corners, 2).
 
-    `number` is that of each polygon's image.
+    `number`: the image of each polygon, or None for the first.
     """
     positions = stack_columns(vertices)[corners]
     normals = stack_columns(vertices, NORMAL)[corners] if set(NORMAL) <= vertices.keys() else None
@@ -89,7 +89,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     """The part of an STL file."""
     data = path.read_bytes()
     announced = int.from_bytes(data[80:STL_HEAD], "little")
-    whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # whatever the header says
+    whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # then it is binary, whatever its first bytes
     if not whole and re.match(rb"(\xef\xbb\xbf)?\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
         corners = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
         if not re.search(rb"(?i)\bendsolid\b", data):
@@ -146,7 +146,7 @@ PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
 def _colored(
     vertices: Columns, corners: np.ndarray, sizes: np.ndarray, of_faces: Columns, loading: Loading
 ) -> list[Part]:
-    """The part of polygons of so many corners, with the colours of their vertices, else those of the polygons."""
+    """The part of polygons with `sizes` corners each, coloured by its vertices, else by its polygons."""
     columns = useful(vertices)
     positions = stack_columns(columns)
     if len(corners) and (loose := len(positions) - len(np.unique(corners))):

@@ -1,12 +1,12 @@
-"""PLY and PCD files as named columns of their points, piece by piece: a header of text lines, then rows, or columns.
+"""PLY and PCD files as named columns of their points, piece by piece: a text header, then rows, or columns.
 
-.ply    ASCII or binary, any order and scalar types.  The header names the elements and their properties; the vertices
-        may stand behind other elements, and have lists, which are stepped over
-.pcd    of the Point Cloud Library, 0.6 and 0.7: ASCII, binary or LZF-compressed.  The header names the fields with
-        their sizes, types (F, I, U) and counts; then come the points, row by row, or, compressed, column by column
+.ply    ASCII or binary, any byte order and scalar types.  The header lists elements and their properties.  Other
+        elements may come before the vertices; lists of vertices are skipped unless they are known columns
+.pcd    Point Cloud Library 0.6 and 0.7: ASCII, binary or LZF-compressed.  The header lists fields with sizes, types
+        (F, I, U) and counts; the points follow row by row or, compressed, column by column
 
-Both say the same of a row: its properties, each a name, a type, and how many numbers (of a list the type of the number
-that says it).  Only one piece of a file is in memory at a time; compressed ones are read whole.
+Both describe a row by properties: name, type and number of items (for a list: the type of its length).  One piece of a
+file is in memory at a time; compressed files are read whole.
 """
 
 import contextlib
@@ -26,10 +26,10 @@ from spnr_jax.formats.columns import ARRAYS, Columns, Report, list_names, name_c
 from spnr_jax.formats.gaussian_files import unpack_columns
 from spnr_jax.formats.point_tables import load_text
 
-Properties = list[tuple[str, str, Any]]  # name, type, and how many numbers, or the type of the number that says it
-Lists = dict[str, tuple[np.ndarray, ...]]  # lengths (rows,), and the items of all rows one behind the other
+Properties = list[tuple[str, str, Any]]  # name, type, number of items, or for a list the type of its length
+Lists = dict[str, tuple[np.ndarray, ...]]  # lengths (rows,), and the items of all rows concatenated
 
-PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of the points that are in memory at a time
+PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of a piece in memory
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
@@ -39,17 +39,17 @@ FACES = ("face", "tristrips")  # elements that make a PLY a mesh
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LIST = 2**20  # items
 PLY_LIMIT, PCD_LIMIT = 2**20, 2**16  # bytes of a header
-POINT_LIMIT = 2**16  # bytes: histograms have some hundreds of numbers, and NumPy crashes on records of 2 GiB
+POINT_LIMIT = 2**16  # bytes of a point: histograms have hundreds of numbers; NumPy crashes on records of 2 GiB
 ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 KINDS = {"F": "<f", "I": "<i", "U": "<u"}
-LONGEST_LITERAL = 32  # control bytes below it announce so many plain bytes, less one; the others copy earlier ones
+LONGEST_LITERAL = 32  # LZF: a control byte c < 32 precedes c + 1 literal bytes; others copy earlier bytes
 
 
 def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bool) -> Iterator[tuple[Columns, Lists]]:
-    """Columns and lists of `count` rows from the file's place on, some at a time.
+    """Columns and lists of the next `count` rows of the file, some at a time.
 
-    Rows whose lists are as long as those of the first are read at once, others one by one.
+    A piece whose lists all have the lengths of its first row is read at once, others row by row.
     """
     lists, done = [name for name, _, width in properties if isinstance(width, str)], 0
     if not count or not properties:
@@ -84,19 +84,19 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
 
 
 def _columns(properties: Properties, rows: Any) -> Columns:
-    """The columns of rows, or of the values of properties by their names."""
+    """The columns of a structured array, or of a dict from property names to values."""
     fields = [(name, width) for name, _, width in properties if not isinstance(width, str)]
     return name_columns({name: rows[name].reshape(-1, width) for name, width in fields})
 
 
 def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, int]:
-    """The layout of a row whose lists are so long, and how many numbers it has."""
+    """The layout of a row whose lists have these lengths, and its number of items."""
     fields: list[tuple] = []
     for name, kind, width in properties:
         if isinstance(width, str):
             fields.append((f"{name} length", width))
             width = lengths[name]
-        if width:  # NumPy reads no field of no numbers from text
+        if width:  # NumPy cannot read empty fields from text
             fields.append((name, kind, *([(width,)] if width > 1 else [])))
     return np.dtype(fields), sum(math.prod(field[2]) if len(field) > 2 else 1 for field in fields)
 
@@ -104,7 +104,7 @@ def _layout(properties: Properties, lengths: dict[str, int]) -> tuple[np.dtype, 
 def _any_rows(
     file: BufferedIOBase, count: int, properties: Properties, text: bool, before: int
 ) -> tuple[Columns, Lists]:
-    """`count` rows one by one, behind those `before`, with lists of any lengths."""
+    """The next `count` rows, read one by one, with lists of any lengths; `before`: number of rows already read."""
     raw: dict[str, list] = {name: [] for name, *_ in properties}
     sizes: dict[str, list[int]] = {name: [] for name, _, width in properties if isinstance(width, str)}
     lines, row, words = _lines(file), before, [""]
@@ -139,37 +139,37 @@ def _any_rows(
 
 
 def _lines(file: BufferedIOBase) -> Iterator[str]:
-    """The lines of text from the file's place on that are not empty."""
+    """The remaining lines of text that are not empty."""
     return (text for line in iter(file.readline, b"") if (text := line.decode("ascii", "replace").strip()))
 
 
 class Header(NamedTuple):
-    """What a PLY or PCD file announces: how its data is written; name, count and properties of its elements in order.
+    """The header of a PLY or PCD file: encoding; name, count and properties of each element in order.
 
-    The points of both are an element `vertex`.
+    The points of both are the element `vertex`.
     """
 
     encoding: str  # ascii, binary or binary_compressed
     elements: list[tuple[str, int, Properties]]
-    textures: tuple[str, ...] = ()  # names of files, by MeshLab's comments
-    organised: bool = False  # one point for each pixel of a depth camera
-    sensor: tuple[float, ...] | None = None  # its place; writers put 0 0 0 there if they do not know it
+    textures: tuple[str, ...] = ()  # file names in MeshLab's comments
+    organised: bool = False  # one point per pixel of a depth camera
+    sensor: tuple[float, ...] | None = None  # its position; often 0 0 0 if unknown
 
     @property
     def faces(self) -> str | None:
-        """The element of faces that make it a mesh."""
+        """The name of the element of faces, if it is a mesh."""
         return next((name for name, count, _ in self.elements if name in FACES and count), None)
 
 
 def read_header(file: BufferedIOBase, kind: str) -> Header:
-    """The header of an open .ply or .pcd file, which is left at its data."""
+    """The header of an open .ply or .pcd file, which is left at the start of its data."""
     return _ply_header(file) if kind == ".ply" else _pcd_header(file)
 
 
 def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
-    """The columns of the points of a .ply or .pcd file, some at a time; a line about rows behind those announced.
+    """The columns of the points of a .ply or .pcd file, some at a time; reports rows beyond the header's count.
 
-    Compressed splats come whole.
+    Compressed files come in one piece.
     """
     with path.open("rb") as file:
         header = read_header(file, kind)
@@ -196,7 +196,7 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
 
 
 def element_pieces(file: BufferedIOBase, header: Header, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
-    """(name, columns, lists) of elements of a PLY file that is at its data, in its order, some rows at a time."""
+    """(name, columns, lists) of the wanted elements of a PLY file at its data, in file order, some rows at a time."""
     left = set(wanted)
     for name, count, properties in header.elements:
         for columns, lists in read_rows(file, count, properties, header.encoding == "ascii") if left else ():
@@ -209,7 +209,7 @@ def element_pieces(file: BufferedIOBase, header: Header, *wanted: str) -> Iterat
 
 
 def read_elements(file: BufferedIOBase, header: Header, *wanted: str) -> dict[str, tuple[Columns, Lists]]:
-    """All columns and lists of elements of a PLY file that is at its data."""
+    """All columns and lists of the wanted elements of a PLY file at its data."""
     pieces, found = list(element_pieces(file, header, *wanted)), {}
     for name in wanted:
         own = [(columns, lists) for element, columns, lists in pieces if element == name]
@@ -221,7 +221,7 @@ def read_elements(file: BufferedIOBase, header: Header, *wanted: str) -> dict[st
 
 
 def join_pieces(pieces: Iterable[Columns]) -> Columns:
-    """The columns of all pieces in one; none if there are no pieces."""
+    """The pieces concatenated; empty if there are none."""
     first, *others = list(pieces) or [{}]
     return {name: np.concatenate([first[name], *(piece[name] for piece in others)]) for name in first}
 
@@ -229,7 +229,7 @@ def join_pieces(pieces: Iterable[Columns]) -> Columns:
 def _ply_header(file: BufferedIOBase) -> Header:
     data = file.read(PLY_LIMIT)
     newline = re.search(rb"\r\n|\n|\r", data)
-    # lines that end in \r alone may be followed by a byte of data that is a \n
+    # after a header with \r line ends, the first byte of data may be a \n
     end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + newline[0], data) if newline else None
     if not data.removeprefix(BOM_UTF8).startswith(b"ply") or end is None:
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
@@ -255,9 +255,9 @@ def _ply_header(file: BufferedIOBase) -> Header:
     if order is None:
         raise UserError(f"has a PLY header without a known format; expected one of {', '.join(BYTE_ORDERS)}")
     file.seek(end.end())
-    for _, _, own in elements:
+    for _, _, own in elements:  # "float" in ASCII is read as f8: the text may have more digits
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
-        own[:] = [(name, kind.replace("=f4", "=f8"), width) for name, kind, width in own]  # text has all digits
+        own[:] = [(name, kind.replace("=f4", "=f8"), width) for name, kind, width in own]
     return Header("ascii" if order == "=" else "binary", elements, tuple(textures))
 
 
@@ -279,8 +279,9 @@ def _pcd_header(file: BufferedIOBase) -> Header:
         counts = map(int, entries.get("COUNT", ["1"] * len(names)))
         num_points = int((entries.get("POINTS") or entries["WIDTH"])[0])
         types = [KINDS[kind] + str(int(size)) for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)]
-        types = [kind if encoding != "ascii" else kind.replace("<f4", "<f8") for kind in types]  # text has all digits
-        # padding is called "_" and may come several times
+        # "F 4" in ASCII is read as f8: the text may have more digits
+        types = [kind if encoding != "ascii" else kind.replace("<f4", "<f8") for kind in types]
+        # padding is called "_" and may occur several times
         plain = [name if name != "_" else f"_{i}" for i, name in enumerate(names)]
         properties: Properties = list(zip(map(str.lower, plain), types, counts, strict=True))
         size = sum(np.dtype(kind).itemsize * width for _, kind, width in properties)
@@ -304,7 +305,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
 
 
 def _packed_columns(body: bytes, points: tuple[str, int, Properties]) -> Columns:
-    """The columns of a compressed file, one field of all points after the other."""
+    """The columns of a compressed file: one field of all points after the other."""
     compressed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     packed = body[8 : 8 + compressed]
     columns: Columns = {}
@@ -315,7 +316,7 @@ def _packed_columns(body: bytes, points: tuple[str, int, Properties]) -> Columns
     except UserError:
         if compressed != plain:
             raise
-        stream = BytesIO(packed)  # some writers announce compressed data and store it as it is
+        stream = BytesIO(packed)  # some writers store uncompressed data here
     for field in points[2]:
         columns |= join_pieces(found for found, _ in read_rows(stream, points[1], [field], text=False))
     if stream.read(1):
@@ -324,7 +325,7 @@ def _packed_columns(body: bytes, points: tuple[str, int, Properties]) -> Columns
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """The `size` bytes that LZF data stands for: pieces of plain bytes, and copies of what came before."""
+    """The `size` bytes of LZF-compressed data: literal bytes, and copies of earlier bytes."""
     plain, place = bytearray(), 0
     try:
         while place < len(data) and len(plain) <= size:
@@ -340,7 +341,7 @@ def decompress(data: bytes, size: int) -> bytes:
             start = len(plain) - distance
             if start < 0:
                 raise IndexError
-            # a copy may reach into itself: the piece so far is then repeated
+            # a copy longer than its distance repeats itself
             plain += (plain[start : start + length] * (length // distance + 1))[:length]
         if len(plain) != size:
             raise IndexError

@@ -1,7 +1,7 @@
-"""Surface points with materials: normalisation of an object, and samples of its surface.
+"""Points sampled on the surface of an object, with materials; and its normalisation.
 
-Points are drawn uniformly by area over all parts, or spread evenly.  The material of each is looked up with the
-interpolation of the renderer and multiplied by the interpolated vertex colour; points that it cuts out are replaced.
+Points are uniform by area over all parts, or evenly spread.  Materials are interpolated as by the renderer and
+multiplied by the interpolated vertex colour; points in cut-out texels are drawn again.
 """
 
 from dataclasses import replace
@@ -15,12 +15,12 @@ from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.triangles import face_crosses, tilt_normals, unit
 
 Spread = Literal["random", "even"]
-MOST_ROUNDS = 64  # of drawing points on a surface that is cut out, before it counts as nowhere
-CANDIDATES = 4  # points drawn for each that is kept of an even spread
+MOST_ROUNDS = 64  # of drawing points on a surface with cut-outs, before it counts as empty
+CANDIDATES = 4  # points drawn for each kept point of an even spread
 
 
 class SurfacePoints(NamedTuple):
-    """Points (n,) on a surface, float32: linear colours and materials in [0, 1], unit normals, global face (int32)."""
+    """Surface points, float32: positions, unit normals, linear base colours (n, 3), materials, global face (n,)."""
 
     positions: np.ndarray
     normals: np.ndarray
@@ -31,7 +31,7 @@ class SurfacePoints(NamedTuple):
 
 
 def bounding_box(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner (3,) of the vertices that faces use; UserError where there is no such box."""
+    """Lowest and highest corner (3,) of the vertices that faces use; UserError if they have no extent."""
     corners = [part.positions[part.faces.ravel()] for part in asset.parts if len(part.faces)]
     if not corners:
         raise UserError("has no faces")
@@ -58,11 +58,10 @@ def normalise(asset: Asset) -> tuple[Asset, dict]:
 def sample_surface(
     asset: Asset, num_points: int, seed: int, spread: Spread = "random", sides: bool = False
 ) -> SurfacePoints:
-    """Points on all faces; the same seed gives the same points.
+    """Points on all faces; deterministic for a seed.
 
-    Random ones are drawn uniformly by area.  Of an even spread each is the farthest of CANDIDATES times as many from
-    those before it, so that any first ones of them are spread evenly too, and thin parts have their share.  With
-    `sides`, those of each side of a thin wall are spread evenly by themselves.
+    "random": uniform by area.  "even": farthest-point sampling of CANDIDATES times as many random points; each prefix
+    is evenly spread, too.  With `sides`, the two sides of a thin wall are spread independently.
     """
     if num_points < 1:
         raise UserError(f"num_points must be at least 1, got {num_points}")
@@ -74,7 +73,7 @@ def sample_surface(
 
 
 def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
-    """Points uniform by area over what is not cut out."""
+    """Points uniform by area over the surface that is not cut out."""
     bounding_box(asset)
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(np.concatenate([face_areas(part) for part in asset.parts]))
@@ -86,7 +85,7 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
         if len(rounds) == MOST_ROUNDS:
             raise UserError("has next to no surface that its textures do not cut out")
         face = np.searchsorted(cumulative, rng.random(num_points) * cumulative[-1], side="right")
-        face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product can round up to the total
+        face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product may round up to the total
         root, along = rng.random((num_points, 2)).T ** [[0.5], [1]]
         barycentric = np.stack([1 - root, root * (1 - along), root * along], axis=-1)  # uniform over the triangle
         vectors, values = np.zeros((3, num_points, 3), np.float32), np.zeros((2, num_points), np.float32)
@@ -102,7 +101,7 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
 
 
 def vertex_points(asset: Asset) -> SurfacePoints:
-    """All vertices as points of face -1, with the mean of their material; normals are 0 where there are none."""
+    """All vertices as points of face -1, with the mean of their material; normals are 0 if there are none."""
     parts = []
     for part in asset.parts:
         look, shape = part.material, part.positions.shape
@@ -119,7 +118,7 @@ def face_areas(part: Part) -> np.ndarray:
 
 
 def _sample_part(part: Part, face: np.ndarray, barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The columns of SurfacePoints but `face`, and whether there is surface, at barycentric (n, 3) of faces (n,)."""
+    """Columns of SurfacePoints, except `face`, at barycentric (n, 3) of faces (n,); and the mask of what is surface."""
     corners, look = part.faces[face], part.material
 
     def interpolate(values: np.ndarray) -> np.ndarray:

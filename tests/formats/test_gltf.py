@@ -25,7 +25,8 @@ from support.point_tables import WHOLE, as_scan
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.gltf import metallic_roughness, unpack
+from spnr_jax.formats.gltf import metallic_roughness
+from spnr_jax.formats.gltf_file import unpack
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import sample_surface
 from spnr_jax.kernels.imaging import srgb_to_linear

@@ -417,7 +417,7 @@ def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, suffix, ki
         struct.pack_into(count, content, announced, 7)
     cloud, lines = read(write(tmp_path, f"a{suffix}", bytes(content)))
     assert len(cloud.positions) == 7
-    assert f"at least {further} points stand behind those that the header announces and are not read" in lines
+    assert f"at least {further} points beyond those that the header announces are not read" in lines
 
 
 # What is refused
