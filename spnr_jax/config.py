@@ -342,8 +342,8 @@ class TrainConfig:
     crop: int = 0
     """Pixels along each side of the random crop of a view that is rendered in training; 0: the whole view."""
     even_share: float = 0.0
-    """Share of the clouds that are farthest-point sampled instead of random.  They are the first points of an object in
-    a data set with `--spread even`; for the surfel network, farthest points of it."""
+    """Share of the training clouds that are farthest-point sampled instead of random.  Surfels: sampled here.  Other
+    networks: the first points of an object, which are even in a data set made with `--spread even`."""
 
     def __post_init__(self) -> None:
         counts = "num_steps", "batch_objects", "views_per_object", "min_points", "max_points", "test_points"

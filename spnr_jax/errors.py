@@ -62,7 +62,7 @@ def first_line(error: Exception) -> str:
 
 @contextlib.contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """UserError, what a file is and why, in place of whatever a library raises that stumbles over it."""
+    """Context that turns a library's exception into UserError("<what> (<reason>)")."""
     try:
         yield
     except (UserError, MemoryError):

@@ -95,12 +95,12 @@ def _call_libc(what: Callable[[ctypes.CDLL], int]) -> None:
 # --- programs on the disk ---------------------------------------------------------------------------------------------
 
 
-SHORTEST = 0.1  # seconds of compilation above which a program is cached
+SHORTEST = 0.1  # seconds of compilation from which a program is cached
 # XLA options for an outermost jit: long programs compile in one to two thirds of the time, and run as fast
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
-CHECK_MARK = "looked-at"  # file whose time says up to when entries are known to be complete
+CHECK_MARK = "looked-at"  # file whose modification time tells which entries were checked: all older ones
 
 
 def cache_folder() -> Path:

@@ -4,7 +4,7 @@
         a list `texcoord` per face, or s t or u v per vertex (MeshLab, OpenMVS)
 .stl    text: three lines `vertex x y z` per triangle; binary: 80 bytes, a count u32, 50 bytes per triangle; a count of
         0 means as many as fit
-.off    [C][N]OFF, counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
+.off    [[C][N]OFF], counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
 """
 
 import io
@@ -23,7 +23,7 @@ from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-OFF_HEAD = re.compile(r"\s*(?:ST)?(C?)(N?)OFF(?=\d|\b)(?!\s+BINARY)([^\S\n]*\n)?")
+OFF_HEAD = re.compile(r"\s*(?:(?:ST)?(C?)(N?)OFF(?=\d|\b))?\s*(?=\d+\s+\d+)")
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
@@ -118,10 +118,10 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
         lines = re.sub(r"#.*", "", file.read()).splitlines()
     text = "\n".join(line for line in lines if line.strip())
     if (head := OFF_HEAD.match(text)) is None:
-        raise UserError("is not an OFF file that can be read: expected OFF, COFF, NOFF or CNOFF in text")
+        raise UserError("is not an OFF file that can be read: expected OFF, COFF, NOFF or CNOFF in text, then counts")
     counts, *rows = text[head.end() :].split("\n")
-    num_vertices, num_faces, *_ = (*(int(word) for word in counts.split()[:2]), 0, 0)
-    if not counts or min(num_vertices, num_faces) < 0 or len(rows) < num_vertices + num_faces:
+    num_vertices, num_faces = (int(word) for word in counts.split()[:2])
+    if len(rows) < num_vertices + num_faces:
         raise UserError(f"is cut off: {num_vertices} vertices and {num_faces} faces announced, {len(rows)} lines found")
     names = [*"xyz", *(NORMAL if head[2] else ()), *SRGB, "alpha"]
     table = np.loadtxt(rows[:num_vertices], ndmin=2) if num_vertices else np.zeros((0, 3))

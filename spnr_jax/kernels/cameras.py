@@ -18,7 +18,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, Rays
 # A direction component below this moves a ray by less than a float32 spacing across 10^4 boxes, so it counts as 0; the
 # square of its inverse, which the gradient contains, stays far from overflow.
 PARALLEL = 1e-12
-ORTHONORMAL = 1e-2  # error of the scalar products of a rotation's columns, from which it is none
+ORTHONORMAL = 1e-2  # |R^T R - I| from which a matrix is no rotation
 
 
 def look_at(

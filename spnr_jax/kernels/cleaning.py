@@ -35,11 +35,11 @@ Values = dict[str, np.ndarray]
 
 LEAST_POINTS = 100  # with fewer points, outliers cannot be told from the surface
 NEIGHBORS = 8  # whose mean distance is a point's score
-SPARSE = 3.0  # times the median distance, above which the neighbours may be outliers themselves
-WIDE = 64  # neighbours that are considered in that case
-ROUND = 16, 0.05  # neighbours of a sparse point; share of their variance across the plane, above which
-MOST_ROUND = 0.1  # they fill a volume: the point is an outlier, unless so large a share of all points does so
-UNLISTED = 0.6  # factor on the limit for a point that is no other point's neighbour
+SPARSE = 3.0  # times the median score: above it, the neighbours may be outliers themselves
+WIDE = 64  # neighbours considered in that case
+ROUND = 16, 0.05  # a point is in a volume if its 16 neighbours have this share of their variance along the normal
+MOST_ROUND = 0.1  # a sparse point in a volume is an outlier, unless more than this share of all points are in one
+UNLISTED = 0.6  # factor on the limit for a point that is not a neighbour of any other
 FEW, CHANCE = 4, 3e-4  # number and share of points that random sampling may isolate
 SURE = 2.0  # factor on the limit above which even these are outliers
 ROUNDS = 3  # repeated, because outliers hide others behind them
@@ -52,9 +52,10 @@ PLANES = 48  # candidate planes, each through three neighbours
 HEIGHTS = 32  # neighbours whose heights above a plane are measured
 SHARE = 0.35  # quantile of the heights that the best plane minimises
 FLATTEST = 0.25  # share of the places from which the noise is estimated: elsewhere edges and thin walls add to it
-NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)  # over the neighbourhood's radius
+# calibration on simulated noisy planes: deviation of the noise over the neighbourhood's radius -> largest height above
+# the best plane over the radius; it saturates, because a thick layer looks like a ball
+NOISES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6)
 THICKNESS = (0.0, 0.012, 0.024, 0.0355, 0.047, 0.0556, 0.0624, 0.0681, 0.0726, 0.0766, 0.0798, 0.0822, 0.0836)
-# largest height above the best plane, over the radius, for planes with these noises: a thick layer looks like a ball
 THICKEST = 0.08  # of a neighbourhood that determines the noise; thicker ones are enlarged
 WIDER, MOST_WIDE = 2, 16  # factor on the number of neighbours; upper bound as a share of all points
 RADIUS = 1.0  # standard deviation of a neighbour's weight over that of the noise; wider ones erode thin parts

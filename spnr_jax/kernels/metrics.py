@@ -1,4 +1,4 @@
-"""Image quality: one number per image, never an average that hides its denominator.
+"""Image quality, one number per image.
 
 Images are float RGB in [0, 1] on white, (*batch, height, width, 3); ValueError for others, or of different shapes.
 """

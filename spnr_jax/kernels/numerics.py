@@ -82,12 +82,12 @@ def clamp(
 
 
 def larger(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
-    """The larger of two: jnp.maximum with a gradient that is always that of one of them (as in `clamp`)."""
+    """max(a, b), whose gradient goes to exactly one of them, also under fused recomputation (see `clamp`)."""
     return jnp.where(a > b, a, b)
 
 
 def smaller(a: Float[Array, "*shape"], b: Float[Array, "*shape"] | float | int) -> Float[Array, "*shape"]:
-    """The smaller of two, with the same property."""
+    """min(a, b), whose gradient goes to exactly one of them."""
     return jnp.where(a < b, a, b)
 
 
@@ -129,10 +129,10 @@ def rotate_columns(
 
 
 def with_gradient(function: Callable, pull_back: Callable) -> Callable:
-    """The function with the gradient `pull_back(primals, cotangents)`, for both modes of differentiation.
+    """The function with a given vector-Jacobian product that also works in forward mode.
 
-    `pull_back` is linear in the cotangents, a tuple like the outputs.  A tangent is computed by its transpose.  Reverse
-    mode transposes that again, which gives `pull_back` itself, operation by operation.
+    `pull_back(primals, cotangents)` is linear in the cotangents, a tuple like the outputs.  The JVP is its transpose;
+    reverse mode transposes that again, which restores `pull_back`.
     """
     differentiable = jax.custom_jvp(function)
 
@@ -184,7 +184,7 @@ def per_feature(vector: Shaped[Array, " features"], like: Array) -> Shaped[Array
 
 
 ROUND = 1e-4  # times the trace, added to variances before they are inverted
-SQUARINGS = 5  # after them, a variance a tenth larger than another weighs twenty times as much
+SQUARINGS = 5  # M^(2^5): a ratio of eigenvalues of 1.1 becomes 1.1^32 = 21
 SHORTEST = 1e-9  # length of a vector that has a direction
 POINT = 1e-9  # least trace of a covariance with extent: gradients divide by its square, kept above 0
 SMALLEST = 1e-7  # times the trace: variances below are rounding
@@ -321,7 +321,7 @@ def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points
 
 
 def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"]:
-    """Ratios of the standard deviations along the axes: planarity, 0 in a plane, and linearity, 0 on a line."""
+    """Ratios of the standard deviations s1 >= s2 >= s3: s3 / s2 (0 in a plane) and s2 / s1 (0 on a line)."""
     scaled, narrowest, widest = split_variances(matrix)
     least, most = (jnp.sum(x * scaled, axis=(0, 1)) for x in (narrowest, widest))
     middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most

@@ -31,13 +31,19 @@ class PointCloud:
     metallic: Float[AnyArray, "*batch points"]
     mask: Bool[AnyArray, "*batch points"]
     normals: Float[AnyArray, "*batch points 3"] | None = None
-    """Of unit length, of either sign; None: they are estimated from these points."""
+    """Unit vectors of either sign; None: estimated from these points."""
     materials_known: Float[AnyArray, "*batch points"] | None = None
     """1 where roughness and metallic are known, else 0; None: known everywhere."""
     learned: Float[AnyArray, "*batch points"] | None = None
-    """0 for a measured point; 1 - p / 2 for a learned one, where p is the probability that it lies on the surface."""
+    """0 for a measured point; for a learned one 1 - p / 2 in [0.5, 1], with its probability p of lying on the surface.
+
+    So the two kinds stay apart for the network: 0.5 is the surest learned point, 1 the least sure one.
+    """
     evenness: Float[AnyArray, "*batch points"] | None = None
-    """How evenly the measured points lie (`surfels.geometry.measure_evenness`); None: as evenly as these points."""
+    """Evenness of the measured points (`surfels.geometry.measure_evenness`); None: that of these points.
+
+    One number for the cloud, repeated for each point so that it is batched and padded like the other fields.
+    """
 
 
 @no_type_check
@@ -109,30 +115,34 @@ class Volume:
 class Surfels:
     """Surface elements of one object (`surfels/geometry.py`): discs with materials; zeros where `mask` is False.
 
-    `spacing` is the side of the square that a point represents, in units of the box.  `color_edge` is a line in the
-    disc's plane: a unit vector across it and its distance from the point; `color_jump` is added to the colour beyond it
-    (0: no edge).  `one_sided` is near 1 where one side is outside, 0 for a two-sided disc.  `visibility` is given from
-    each of 64 directions.  `shape_ratios` are the planarity and linearity of the neighbourhood.  `rim_distances` are
-    the distances, in spacings, at which the disc ends: along `rim_tangent` (a unit vector in its plane), against it,
-    along normal x rim_tangent and against that.  `materials_unknown` is 1 where roughness and metallic are unknown.
-    `learned` is 0 for a measured point and above 0 for a learned one (`method/densifier.py`).
+    Lengths are in units of the box, colours linear.
     """
 
     position: Float[AnyArray, "*batch points 3"]
     normal: Float[AnyArray, "*batch points 3"]
     spacing: Float[AnyArray, "*batch points"]
+    """Side of the square that a point represents."""
     base_color: Float[AnyArray, "*batch points 3"]
     color_edge: Float[AnyArray, "*batch points 4"]
+    """A line in the disc's plane: unit vector across it, and its distance from the point."""
     color_jump: Float[AnyArray, "*batch points 3"]
+    """Added to the colour beyond the edge; 0: no edge."""
     roughness: Float[AnyArray, "*batch points"]
     metallic: Float[AnyArray, "*batch points"]
     materials_unknown: Float[AnyArray, "*batch points"]
+    """1 where roughness and metallic are unknown, else 0."""
     learned: Float[AnyArray, "*batch points"]
+    """As in PointCloud."""
     one_sided: Float[AnyArray, "*batch points"]
+    """0 for a two-sided disc, up to 0.98 if only the side of the normal is outside."""
     visibility: Float[AnyArray, "*batch points 64"]
+    """In [0, 1], from each of the directions `sides.DIRECTIONS`."""
     shape_ratios: Float[AnyArray, "*batch points 2"]
+    """Ratios of the neighbourhood's deviations (`numerics.measure_shape`): thickness / width, width / length."""
     rim_tangent: Float[AnyArray, "*batch points 3"]
+    """Unit vector in the disc's plane."""
     rim_distances: Float[AnyArray, "*batch points 4"]
+    """Extents of the disc in spacings: along +rim_tangent, -rim_tangent, +normal x rim_tangent and its opposite."""
     mask: Bool[AnyArray, "*batch points"]
 
 
@@ -210,25 +220,30 @@ def check_light(light: Light | None) -> None:
 @no_type_check
 @struct.dataclass
 class GBuffer:
-    """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes.
+    """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes, 0 without discs.
 
-    `opacity` is the sum of the blend weights of the listed entries, at most 1; `coverage` that of their squared
-    kernels, faded for back faces, times the transmittance in front of them: it grows with overlap.  `depth` is along
-    the camera's axis, `depth_deviation` its standard deviation.  `color` is blended with narrower weights than the
-    rest; `sharp_weight` is their sum, and `centre_offset` the mean offset of the discs' centres from the pixel's, in
-    pixels.  All fields are 0 at pixels without discs.
+    Entry i of a pixel has the kernel k_i, the facing f_i, the transmittance T_i in front of it, the blend weight a_i
+    and the narrower weight b_i = a_i k_i^4 f_i.  Means are weighted by a_i where nothing else is said.
     """
 
     opacity: Float[Array, "height width"]
+    """sum a_i, at most 1."""
     coverage: Float[Array, "height width"]
+    """sum k_i^2 f_i T_i: grows with overlap."""
     depth: Float[Array, "height width"]
+    """Mean depth along the camera's axis, in units of the box."""
     depth_deviation: Float[Array, "height width"]
+    """Standard deviation of the depth."""
     log_spacing: Float[Array, "height width"]
     normal: Float[Array, "height width 3"]
     color: Float[Array, "height width 3"]
+    """Mean by b_i, where the ray meets the discs."""
     attributes: Float[Array, "height width features"]
+    """Means of nn.shader.ATTRIBUTES."""
     sharp_weight: Float[Array, "height width"]
+    """sum b_i."""
     centre_offset: Float[Array, "height width 2"]
+    """Mean, by b_i, of the offset of the discs' centres from the pixel's centre, in pixels."""
 
 
 @no_type_check

@@ -71,9 +71,10 @@ def select_object(
     nth: int | None,
     seed: int,
 ) -> tuple[Int[np.ndarray, " left"], list[str]]:
-    """Rows of the points that remain without the dominant plane and in the nth largest cluster (None: all); messages.
+    """Indices of the points to keep, and messages: without the dominant plane, then of the nth largest cluster only.
 
-    Messages give positions as positions + origin.  ValueError without such a plane, another point, or such a cluster.
+    `nth` None keeps all clusters.  Messages give positions as positions + origin.  ValueError if there is no such plane
+    or cluster, or if all points lie in the plane.
     """
     rows, lines = np.arange(len(positions)), []
     if remove_plane:

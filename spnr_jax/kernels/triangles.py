@@ -1,24 +1,26 @@
-"""A mesh's arrays: triangles of polygons and strips, and normals.  NumPy in, NumPy out.
+"""Mesh arrays: triangulation of polygons and strips, and normals.  NumPy in, NumPy out.
 
-Polygons become fans of triangles, or ears (Meisters 1975) where a fan would cover a notch.
+Polygons become fans of triangles; where a fan would cover a notch, ears are clipped (Meisters 1975).
 
-A texel of a normal map says where the normal points along the directions in which u grows, in which v falls (v runs
-down the rows, and the map's green is up), and outwards.  On a triangle the position is linear in the texture
-coordinates, so that two of its edges give both directions; they are made perpendicular to the interpolated normal.
-Where the coordinates have no area the normal stays.
+A texel of a normal map holds the components of the normal along increasing u, decreasing v (green is up) and outwards.
+On a triangle the position is linear in the texture coordinates, so two edges give both tangents; they are made
+perpendicular to the interpolated normal.  Where the texture coordinates have no area, the normal is kept.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-MOST_CORNERS = 2048  # of a polygon whose ears are looked for; a larger one becomes a fan
+MOST_CORNERS = 2048  # larger polygons always become fans
 
 
 def triangulate(
     positions: np.ndarray, corners: np.ndarray, sizes: Sequence[int] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Faces (f, 3) of polygons of so many corners, vertex numbers, in their order, and the polygon that each is of."""
+    """Triangles (f, 3) of polygons, and the index of the polygon (f,) of each; polygons keep their order.
+
+    `corners`: vertex indices of all polygons, concatenated; `sizes`: number of corners of each polygon.
+    """
     count, corners = np.array(sizes, np.int64), corners.astype(np.int64)
     begin = np.cumsum(count) - count
     faces, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
@@ -29,8 +31,8 @@ def triangulate(
         if 3 < size <= MOST_CORNERS and (own >= 0).all() and own.max() < len(positions):
             crosses = face_crosses(positions, fan.reshape(-1, 3)).reshape(fan.shape)
             share = np.einsum("mnc,mc->mn", crosses, crosses.sum(axis=1))
-            turned = share < -1e-9 * np.abs(share).max(axis=1)[:, None]  # against the sense of the whole
-            for row in np.flatnonzero(turned.any(axis=1)):
+            flipped = share < -1e-9 * np.abs(share).max(axis=1)[:, None]  # against the polygon's orientation
+            for row in np.flatnonzero(flipped.any(axis=1)):
                 fan[row] = own[row][ears(positions[own[row]])]
         faces.append(fan.reshape(-1, 3))
         owners.append(np.repeat(rows, size - 2))
@@ -40,11 +42,11 @@ def triangulate(
 
 
 def ears(corners: np.ndarray) -> np.ndarray:
-    """Triangles (n - 2, 3) of a simple polygon (n, 3), as numbers of its corners; a fan of what is not simple."""
+    """Triangles (n - 2, 3) of a simple polygon with corners (n, 3), as indices; a fan if it is not simple."""
     centred = corners - corners.mean(axis=0)
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
-    flat = np.roll(centred, 2 - axis, axis=1)[:, :2] * [1, np.sign(normal[axis]) or 1]  # from the side it turns left on
+    flat = np.roll(centred, 2 - axis, axis=1)[:, :2] * [1, np.sign(normal[axis]) or 1]  # counter-clockwise
     left, found, i, failed = list(range(len(corners))), [], 0, 0
     while len(left) > 3 and failed < len(left):
         ear = [left[i - 1], left[i], left[(i + 1) % len(left)]]
@@ -54,7 +56,7 @@ def ears(corners: np.ndarray) -> np.ndarray:
         if edges[0, 0] * edges[1, 1] > edges[0, 1] * edges[1, 0] and not inside.any():
             found.append(tuple(ear))
             left.pop(i)
-            i, failed = max(i - 1, 0), 0  # what lies before was no ear, and still is none
+            i, failed = max(i - 1, 0), 0  # earlier corners are still no ears
         else:
             i, failed = (i + 1) % len(left), failed + 1
     return np.array(found + [(left[0], b, c) for b, c in zip(left[1:-1], left[2:], strict=True)])

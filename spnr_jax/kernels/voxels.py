@@ -1,10 +1,10 @@
 """Points to volume and back (scatter to voxels, trilinear lookup), and empty-space skipping.
 
 A scatter is a sum: each point adds its features, over the number of points in its voxel, to the voxel
-(`mean_contributions`).  `gather_rows` and `scatter_rows` are each other's transpose.  Under vmap both flatten the
-mapped axes into one table: XLA lowers a batched scatter on CPU to a loop about four times slower than a flat one (32^3
-voxels, 2 objects).  On a device mesh there is a table per group of objects; in a common one XLA could not know that
-rows stay on their device.
+(`mean_contributions`).  `gather_rows` and `scatter_rows` are each other's transpose.  vmap of either is a single gather
+or scatter in a table with the rows of all batch elements end to end: on a CPU, XLA's batched scatter is a loop that is
+about four times slower (32^3 voxels, 2 objects).  On a device mesh there is one such table per device; in a common one
+XLA could not know that rows stay on their device.
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel
@@ -364,10 +364,10 @@ def distance_at(path: RayPath, travelled: Float[Array, "*batch samples"]) -> Flo
 
 
 def map_existing(function: Callable, exists: Bool[Array, " rows"], inputs: Any, empty: Any, block: int) -> Any:
-    """`function` of the rows of the inputs that exist and `empty` for the others, `block` rows at a time.
+    """Applies `function` to the rows where `exists`, in blocks of `block` rows; the other rows get `empty`.
 
-    Blocks beyond the last existing row are skipped: time depends on the existing rows, memory on the block.  For the
-    gradient a block is computed again, instead of stored.
+    Existing rows are packed first and empty blocks skipped: time depends on the existing rows, memory on the block.
+    The gradient recomputes each block.
     """
     total = exists.shape[0]
     block = min(block, total)

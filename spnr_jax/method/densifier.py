@@ -29,7 +29,7 @@ from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, measure_ev
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
 SPARSE = 8192  # points of a cloud up to which points are added everywhere; larger ones: rims, curves, thin walls
 OPPOSED_COSINE, WALL_SHARE = -0.5, 0.2  # a thin wall: this share of the neighbors has normals below this cosine
-BENT = 0.3  # a pair counts as bent above this: heights of both ends, in spacings, + 1 - cosine of the normals
+BENT = 0.3  # a pair is bent if |h_i| / s + |h_j| / s + 1 - cos > BENT: heights over the other's plane, spacing, normals
 CANDIDATES = 6  # candidates of each point: middles of the pairs that it owns, then open places
 NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
@@ -38,6 +38,7 @@ LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
 TANGENT_DIRECTIONS = 6  # tested for openness in each tangent plane; the first points to the nearest neighbor
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
 OPEN_DISTANCE = 0.5  # spacings from a point to its open place
+AFTER_PAIRS = 1e3  # rank of an open place: above the length of any pair in spacings
 LEAST_DISTANCE = 0.2  # spacings: a learned point closer than this to a measured or a better learned one is dropped
 NORMAL_PENALTY = 1.5  # times (1 - cosine of the normals), added to the squared ratio of a distance to LEAST_DISTANCE
 LARGEST_GAP = 4.0  # cap of that squared ratio to measured points: being farther away is no better
@@ -105,8 +106,10 @@ def propose(
 ) -> tuple[Int[Array, "n c"], Bool[Array, "n c"], Float[Array, "n c 3"]]:
     """For each point: the other ends of its pairs, which of them exist, and directions to open places (end: the point).
 
-    Pairs are the edges of a Gabriel graph: the sphere over a pair holds no other neighbor.  One end owns the pair: that
-    of the lower or the higher index, depending on the parity of their sum, so that all points own about as many.
+    Pairs are the edges of a beta-skeleton: no other neighbor sees the two ends at an angle above 113.6 degrees (cosine
+    below -BETWEEN; a Gabriel graph has 90 degrees).  A pair that is in the lists of both ends belongs to one of them,
+    the lower or the higher index by the parity of their sum, so that all points own about as many.  Each point has
+    CANDIDATES slots: its pairs by length, then open directions by angle.
     """
     own = jnp.arange(len(neighbors), dtype=neighbors.dtype)
     other = neighbors[:, 1:]
@@ -140,7 +143,7 @@ def propose(
     along = jnp.einsum("nwi,nai->nwa", directions, flat)
     closed = (along > BESIDE) & (real & ~crosses_wall & (size < NEAR * reach))[:, None]
     free = ~jnp.any(closed, axis=2) & real[:, :1]
-    ranks = jnp.where(pair, size / reach, jnp.inf), jnp.where(free, 1e3 + angle[None], jnp.inf)
+    ranks = jnp.where(pair, size / reach, jnp.inf), jnp.where(free, AFTER_PAIRS + angle[None], jnp.inf)
     rank = jnp.concatenate(ranks, axis=1)
     order = jnp.argsort(rank, axis=1)[:, :CANDIDATES]
     exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf

@@ -33,7 +33,7 @@ BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab
 
 
 class PlannedView(NamedTuple):
-    """A view with its light, and its requirements: the camera that is drawn, doublings and side, sizes."""
+    """A view with its light: the camera that is drawn (smaller for `balanced`), (doublings, side), sizes needed."""
 
     camera: Camera
     light: Light

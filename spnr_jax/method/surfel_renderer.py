@@ -41,8 +41,9 @@ from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, compose_picture
 from spnr_jax.surfels import lighting, splatting
 from spnr_jax.surfels.splatting import MOST_ENTRIES
 
-COARSEST = 3.5  # pixels between points above which the G-buffer has half the picture's resolution
-FINEST = 0.8  # pixels between points below which it has twice the resolution and is averaged
+# With the spacing p of the points in pixels: the fewest doublings n for which p / 2^n < COARSEST; a G-buffer of twice
+# the picture's resolution, averaged, if p < FINEST
+COARSEST, FINEST = 3.5, 0.8
 SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture is small, and its FINEST
 MOST_DOUBLINGS = 4
 NEAREST = 0.5  # distance, in units of the box, at which an eye inside the object sees its points
@@ -54,8 +55,9 @@ LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 class Plan(NamedTuple):
     """Static sizes of a picture: hashable, made by `plan` or by hand.
 
-    `doublings` by the network; `side`: each pixel averages side x side drawn ones (1 or 2); `width` and `height` of the
-    window, in pixels of the G-buffer; capacities: `entries` (pairs of disc and pixel) and `slots` (covered pixels).
+    doublings: how often the network doubles the G-buffer's resolution.  side: 1, or 2 for supersampling: a pixel
+    averages side x side drawn ones.  width, height: the window, in pixels of the G-buffer.  entries, slots: capacities
+    for pairs of disc and pixel, and for covered pixels.
     """
 
     doublings: int
@@ -81,8 +83,8 @@ class Sizes(NamedTuple):
 def plan(scene: SurfelScene, camera: Camera) -> Plan:
     """Sizes that suffice for every view of a camera or a batch of cameras, and one scene or a stack of scenes.
 
-    Runs on the host, because array sizes cannot be traced.  The axes of a stack of scenes lead those of the cameras, or
-    the cameras have none.  ValueError if a picture needs more entries than can be sorted.
+    Runs on the host, because array sizes cannot be traced.  For a stack of scenes (*scenes), cameras are (*scenes,
+    *views), or one camera for all.  ValueError if a picture needs more entries than can be sorted.
     """
     _check_scene(scene, "plan")
     cloud_arrays.refuse_tracers(scene, "plan")

@@ -15,6 +15,7 @@ from operator import add
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
@@ -34,11 +35,51 @@ from spnr_jax.surfels import lighting
 from spnr_jax.surfels.lighting import SPECULAR
 from spnr_jax.surfels.sides import DIRECTIONS
 
+# --- channels ---------------------------------------------------------------------------------------------------------
+
+
+ATTRIBUTES = {  # of a surfel, blended over pixels: name -> number of channels; those of the light are linear in it
+    **{"roughness": 1, "metallic": 1, "irradiance": 3, "reflected": 1, "openness": 1, "bent_normal": 3},
+    **{"base_color": 3, "shape_ratios": 2, "one_sided": 1, "materials_unknown": 1, "learned": 1, "squared_grey": 1},
+}
+INPUTS = {  # of the network; they do not depend on the light
+    **{"opacity": 1, "log_coverage": 1, "roughness": 1, "metallic": 1, "openness": 1, "reflected": 1},
+    **{"depth_deviation": 1, "relief": 2, "log_pixels": 1, "shape_ratios": 2, "one_sided": 1, "cosine": 1},
+    **{"normal": 3, "bent_normal": 3, "color": 3, "blended_color": 3, "drawn": 1, "sharp_weight": 1},
+    **{"centre_offset": 2, "materials_unknown": 1, "learned": 1, "contrast": 1},
+}
+MAPS = {  # material and light maps that the outputs are factors of
+    **{"color": 3, "metallic": 1, "opacity": 1, "factor": 1, "summand": 1},
+    **{"irradiance": 3, "unshadowed": 3, "mirrored": 3, "reflected": 1},
+}
+OUTPUTS = {  # of the network; `compose_picture` has the formulas
+    **{"color_step": 3, "logit_step": 1, "shade": 1, "open_sky": 1, "shine": 1, "glow": 1},
+    **{"bounced_constant": 3, "bounced_bands": 8, "metallic_step": 1, "rougher": 1},
+}
+NUM_FEATURES, NUM_OUTPUTS = sum(INPUTS.values()), sum(OUTPUTS.values())
+
+
+def stack_channels(values: dict[str, Array], channels: dict[str, int]) -> Float[Array, "*batch channels"]:
+    """The named values in the order of a table; those of one channel have no axis of channels."""
+    assert values.keys() == channels.keys()
+    return jnp.concatenate([values[x][..., None] if n == 1 else values[x] for x, n in channels.items()], axis=-1)
+
+
+def split_channels(stacked: Float[Array, "*batch channels"], channels: dict[str, int]) -> dict[str, Array]:
+    """The inverse of `stack_channels`."""
+    parts = jnp.split(stacked, np.cumsum([*channels.values()])[:-1], axis=-1)
+    return {x: part[..., 0] if n == 1 else part for (x, n), part in zip(channels.items(), parts, strict=True)}
+
+
+def find_odd_inputs(axis: int) -> list[int]:
+    """Indices of the inputs that change their sign when the picture is mirrored along x (0) or y (1)."""
+    first = dict(zip(INPUTS, np.cumsum([0, *INPUTS.values()]).tolist(), strict=False))
+    return [first[name] + axis for name in ("normal", "bent_normal", "centre_offset")]
+
+
 # --- inputs -----------------------------------------------------------------------------------------------------------
 
 
-NUM_FEATURES = 33
-ODD = (14, 17, 28), (15, 18, 29)  # features that change their sign when the picture is mirrored along x, or along y
 FAINT = 0.02  # opacity at which a pixel's features have half their value
 WINDOWS = 2, 6  # pixels to each side over which the depth is compared
 EDGE = 0.6  # coverage at the outline: discs reach beyond the surface, half of their weight
@@ -50,58 +91,80 @@ SHARPEST = 0.25  # largest difference between the sharp colour and the blended o
 
 def face_camera(surfels: Surfels, camera: Camera) -> Surfels:
     """The surfels with all normals turned to the camera."""
-    view = camera.cam_to_world[:, 3][None] - surfels.position
-    behind = jnp.sum(view * surfels.normal, axis=1, keepdims=True) < 0
+    to_eye = camera.cam_to_world[:, 3][None] - surfels.position
+    behind = jnp.sum(to_eye * surfels.normal, axis=1, keepdims=True) < 0
     return dataclasses.replace(surfels, normal=jnp.where(behind, -surfels.normal, surfels.normal))
 
 
 def compute_attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[Array, "points 19"]:
-    """Attributes of each surfel that are blended over pixels; those of the light are linear in it."""
+    """ATTRIBUTES of each surfel.
+
+    With the visibilities v_d of the DIRECTIONS d and the normal n: openness sum_d v_d max(n.d, 0) / sum_d max(n.d, 0);
+    bent normal 4 mean_d(v_d d), in camera axes; reflected, the mean of v_d over a lobe around the mirrored ray.
+    """
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     cosines = larger(jnp.einsum("pi,di->pd", surfels.normal, DIRECTIONS, precision="highest"), 0)
-    openness = jnp.sum(surfels.visibility * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6)
     bent = 4 / len(DIRECTIONS) * jnp.einsum("pd,di->pi", surfels.visibility, DIRECTIONS, precision="highest")
-    view = normalize(jnp.asarray(eye[None] - surfels.position))
-    along = jnp.sum(view * surfels.normal, axis=1, keepdims=True)
-    mirror = 2 * jnp.abs(along) * jnp.where(along < 0, -1.0, 1.0) * surfels.normal - view
-    lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirror, DIRECTIONS, precision="highest") - 1))
-    reflected = jnp.sum(surfels.visibility * lobe, axis=1) / jnp.sum(lobe, axis=1)
-    parts = [surfels.roughness, surfels.metallic, lighting.gather_irradiance(surfels, light), reflected, openness]
-    parts += [jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"), surfels.base_color, surfels.shape_ratios]
-    parts += [surfels.one_sided, surfels.materials_unknown, surfels.learned, jnp.mean(surfels.base_color, axis=1) ** 2]
-    return jnp.concatenate([x[:, None] if x.ndim == 1 else x for x in map(jnp.asarray, parts)], axis=1)
+    to_eye = normalize(jnp.asarray(eye[None] - surfels.position))
+    cosine = jnp.sum(to_eye * surfels.normal, axis=1, keepdims=True)
+    mirrored = 2 * cosine * surfels.normal - to_eye
+    lobe = jnp.exp(lighting.LOBE * (jnp.einsum("pi,di->pd", mirrored, DIRECTIONS, precision="highest") - 1))
+    own = ("roughness", "metallic", "base_color", "shape_ratios", "one_sided", "materials_unknown", "learned")
+    values = {name: jnp.asarray(getattr(surfels, name)) for name in own} | {
+        "irradiance": lighting.gather_irradiance(surfels, light),
+        "reflected": jnp.sum(surfels.visibility * lobe, axis=1) / jnp.sum(lobe, axis=1),
+        "openness": jnp.sum(surfels.visibility * cosines, axis=1) / larger(jnp.sum(cosines, axis=1), 1e-6),
+        "bent_normal": jnp.einsum("pi,ij->pj", bent, rotation, precision="highest"),
+        "squared_grey": jnp.mean(jnp.asarray(surfels.base_color), axis=1) ** 2,
+    }
+    return stack_channels(values, ATTRIBUTES)
 
 
 def compute_inputs(
     buffer: GBuffer, light: Light, camera: Camera
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
-    """The network's inputs, which do not depend on the light, and material and light maps for `compose_picture`."""
-    first, bent, blended, last = jnp.split(buffer.attributes, (7, 10, 13), axis=-1)
-    (roughness, metallic, *arriving, reflected, openness), of_surface = map(split_columns, (first, last))
-    planarity, linearity, one_sided, materials_unknown, learned, squared = of_surface
+    """The network's INPUTS, and the MAPS for `compose_picture`."""
+    of = split_channels(buffer.attributes, ATTRIBUTES)
+    blended = of["base_color"]
     confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
     color = clamp(blended + confidence * clamp(buffer.color - blended, -SHARPEST, SHARPEST), 0, 1)
-    normal, view = _directions(buffer, camera)
-    cosine = -reduce(add, (n * v for n, v in zip(normal, view, strict=True)))
-    mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
-    world = [_to_world(camera, direction) for direction in (normal, mirror)]
-    factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
+    normal, ray = _directions(buffer, camera)
+    cosine = -reduce(add, (n * v for n, v in zip(normal, ray, strict=True)))
+    mirrored = [v + 2 * cosine * n for n, v in zip(normal, ray, strict=True)]
+    normal_in_world, mirrored_in_world = (_to_world(camera, direction) for direction in (normal, mirrored))
+    factor, summand = lighting.reflectance(of["roughness"], clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
-    numbers = [buffer.opacity, jnp.log1p(buffer.coverage), roughness, metallic, openness, reflected]
-    numbers += [smaller(buffer.depth_deviation / spacing, 4), *(_relief(buffer, spacing, reach) for reach in WINDOWS)]
-    numbers += [0.5 * jnp.log(in_pixels), planarity, linearity, one_sided, cosine]
-    vectors = [buffer.normal, bent, linear_to_srgb(color), linear_to_srgb(blended)]
-    drawn = (buffer.opacity / (buffer.opacity + FAINT))[..., None]
-    pattern = [jnp.log1p(8 * buffer.sharp_weight)[..., None], clamp(buffer.centre_offset / in_pixels[..., None], -2, 2)]
-    inputs = jnp.concatenate([jnp.stack(numbers, axis=-1), *vectors], axis=-1)
-    covered = buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE)
-    contrast = safe_sqrt(squared - jnp.mean(blended, axis=-1) ** 2)  # standard deviation of the blended colours
-    pattern += [materials_unknown[..., None], learned[..., None], contrast[..., None]]
-    inputs = jnp.concatenate([drawn * inputs, drawn, *(drawn * x for x in pattern)], axis=-1)
-    unshadowed = lighting.irradiance(light, world[0]), lighting.reflect(light, world[1], roughness)
-    maps = [*split_columns(color), metallic, covered, factor, summand, *arriving]
-    return inputs, jnp.stack([*maps, *unshadowed[0], *unshadowed[1], reflected], axis=-1)
+    drawn = buffer.opacity / (buffer.opacity + FAINT)
+    inputs = {
+        "opacity": buffer.opacity,
+        "log_coverage": jnp.log1p(buffer.coverage),
+        **{name: of[name] for name in INPUTS.keys() & of.keys()},
+        "depth_deviation": smaller(buffer.depth_deviation / spacing, 4),
+        "relief": jnp.stack([_relief(buffer, spacing, reach) for reach in WINDOWS], axis=-1),
+        "log_pixels": 0.5 * jnp.log(in_pixels),
+        "cosine": cosine,
+        "normal": buffer.normal,
+        "color": linear_to_srgb(color),
+        "blended_color": linear_to_srgb(blended),
+        "drawn": jnp.ones_like(drawn),
+        "sharp_weight": jnp.log1p(8 * buffer.sharp_weight),
+        "centre_offset": clamp(buffer.centre_offset / in_pixels[..., None], -2, 2),
+        # standard deviation of the grey values of the blended colours
+        "contrast": safe_sqrt(of["squared_grey"] - jnp.mean(blended, axis=-1) ** 2),
+    }
+    maps = {
+        "color": color,
+        "metallic": of["metallic"],
+        "opacity": buffer.opacity * larger(one_minus_exp((buffer.coverage / EDGE) ** 2), HAZE),
+        "factor": factor,
+        "summand": summand,
+        "irradiance": of["irradiance"],
+        "unshadowed": jnp.stack(lighting.irradiance(light, normal_in_world), axis=-1),
+        "mirrored": jnp.stack(lighting.reflect(light, mirrored_in_world, of["roughness"]), axis=-1),
+        "reflected": of["reflected"],
+    }
+    return drawn[..., None] * stack_channels(inputs, INPUTS), stack_channels(maps, MAPS)
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:
@@ -146,7 +209,6 @@ def _box(values: Float[Array, "height width"], reach: int) -> Float[Array, "heig
 # --- network ----------------------------------------------------------------------------------------------------------
 
 
-NUM_OUTPUTS = 21
 COLOR_STEP, LOGIT_STEP = 0.3, 2.0  # change of the base colour, and of the opacity's logit, by an output of 1
 LOGIT_MARGIN = 1e-2  # keeps the logits of 0 and 1 finite
 NOTHING = 2e-4  # opacity below which a pixel stays transparent
@@ -212,29 +274,30 @@ def logit(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
 def compose_picture(
     outputs: Float[Array, "batch h w 21"],
     maps: Float[Array, "batch height width 17"],
-    ambient: Float[Array, "batch 9 3"],
+    light_harmonics: Float[Array, "batch 9 3"],
     doublings: int,
 ) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
-    """sRGB colour and opacity: materials lit by the light maps, times the factors of the network.
+    """sRGB colour and opacity: materials lit by the light MAPS, times factors of the network's OUTPUTS.
 
-    `maps` are those of `compute_inputs`, `ambient` the light's spherical harmonics in camera axes.
+    `light_harmonics` are the spherical harmonics of the light in camera axes.
     """
     for _ in range(doublings):
         maps = double_size(maps)
-    color, metallic, opacity, factor, summand, arriving, unshadowed, mirrored, reflected = jnp.split(
-        maps, (3, 4, 5, 6, 7, 10, 13, 16), axis=-1
+    by_map, by_output = split_channels(maps, MAPS), split_channels(outputs, OUTPUTS)
+    (factor, summand, reflected), (shade, open_sky, shine, glow) = (
+        [values[name][..., None] for name in names.split()]
+        for values, names in ((by_map, "factor summand reflected"), (by_output, "shade open_sky shine glow"))
     )
-    step, logit_step, shade, open_sky, shine, glow, bounce, bounces, metal_step, rougher = jnp.split(
-        outputs, (3, 4, 5, 6, 7, 8, 11, 19, 20), axis=-1
-    )
-    base = clamp(color + COLOR_STEP * step, 0, 1)
-    alpha = nn.sigmoid(logit(opacity) + LOGIT_STEP * logit_step) * one_minus_exp(opacity / NOTHING)
-    bounced = bounce * ambient[:, None, None, 0]
-    bounced += jnp.einsum("bhwk,bkc->bhwc", bounces, ambient[:, 1:], precision="highest")
-    metallic = clamp(metallic + COLOR_STEP * metal_step, 0, 1)
-    mirrored += clamp(rougher, 0, 1) * (unshadowed - mirrored)
-    diffuse = (1 + shade) * arriving + open_sky * unshadowed + bounced
+    base = clamp(by_map["color"] + COLOR_STEP * by_output["color_step"], 0, 1)
+    metallic = clamp(by_map["metallic"] + COLOR_STEP * by_output["metallic_step"], 0, 1)[..., None]
+    coverage = by_map["opacity"]
+    alpha = nn.sigmoid(logit(coverage) + LOGIT_STEP * by_output["logit_step"]) * one_minus_exp(coverage / NOTHING)
+    bounced = by_output["bounced_constant"] * light_harmonics[:, None, None, 0]
+    bounced += jnp.einsum("bhwk,bkc->bhwc", by_output["bounced_bands"], light_harmonics[:, 1:], precision="highest")
+    unshadowed, mirrored = by_map["unshadowed"], by_map["mirrored"]
+    mirrored += clamp(by_output["rougher"], 0, 1)[..., None] * (unshadowed - mirrored)
+    diffuse = (1 + shade) * by_map["irradiance"] + open_sky * unshadowed + bounced
     specular = (1 + shine) * reflected + glow
     normal_incidence = SPECULAR * (1 - metallic) + base * metallic
     linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
-    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha[..., 0]
+    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha

@@ -93,9 +93,10 @@ def bridge_gaps(uv: Float[Array, "k 2 block"], membership: Float[Array, "k block
     """Factor by which a disc is enlarged beside gaps, so that the discs around a gap cover its middle.
 
     A gap is an empty circle through the point with other points all around it; its center is a vertex of the Voronoi
-    diagram in the tangent plane.  For each direction, consider the largest empty circle through the point whose center
-    lies there.  Its radius has a local maximum at a Voronoi vertex, and no limit where the layer ends.  After the
-    inversion p -> 2 p / |p|^2, the distance of the farthest point in the direction is the curvature of that circle.
+    diagram in the tangent plane.  The largest empty circle through the point with its center in direction d has the
+    curvature k(d) = max_j d . y_j, with the inversions y_j = 2 p_j / |p_j|^2 of the neighbors.  k has a local minimum
+    at a Voronoi vertex, and is at most 0 where the layer ends.  The factor is max(1, radius / gap_cover) of the largest
+    gap.
     """
     half = (uv[:, 0] ** 2 + uv[:, 1] ** 2) / 2
     other = (membership > 0.5) & (half > CONSTANTS.duplicate_distance)

@@ -7,7 +7,7 @@ normal      given, or else that of the layer (layers.py); the outer side is foun
 one_sided   1 where the votes agree on the outer side, 0 where both sides are equally visible (a two-sided disc)
 color_edge  a straight edge between two colors inside a disc; color_jump is the change of color across it (discs.py)
 rim         where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
-shape       planarity and linearity: ratios of the neighbors' extents, 0 in a plane, 0 on a line
+shape       ratios of the neighbors' deviations: thickness / width (0 in a plane), width / length (0 on a line)
 scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
 Points are processed in blocks, one after the other, so that a million fit into memory.  A block reads its neighbors
@@ -53,7 +53,7 @@ from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 BLOCK = 2**14  # points per query of the k-d tree
 NEAREST = 32  # nearest points among which the neighbors of a point with a normal are chosen
-APART = 0.3  # mean distances to the nearest points, added in quadrature to a distance for normals at 60 degrees
+APART = 0.3  # squared distances get (0.3 m)^2 |n - n'|^2 added, with the mean distance m to the neighbors
 OPPOSED = 2.0  # spacings added, in quadrature, to the distance of a neighbor with the opposite normal
 
 
@@ -240,14 +240,14 @@ def map_blocks(
     """The results of `work` for all blocks of points, concatenated.
 
     `work` receives the neighborhoods of a block (with these columns of the neighbors) and the block's part of the `own`
-    arrays (..., points).  All values of a block travel in one array.  For the gradient, only
-    the inputs of a block are kept, and the block is computed again.
+    arrays (..., points).  All values of a block are packed into one array, so that the loop has one input and one
+    output.  The gradient keeps the inputs of a block and recomputes the rest.
     """
     count = points.mask.shape[0]
     size = min(CONSTANTS.block_size, count)
     table = jnp.concatenate([points.position, columns])
     neighbors, packed = points.neighbors, _pack((points.position, own))
-    forms: list[Any] = []
+    forms: list[Any] = []  # structure of the results, known once `compute` is traced: lax.cond traces it before `skip`
 
     def compute(neighbors: Array, packed: Array) -> Array:
         positions, values = _unpack(packed, (points.position, own))

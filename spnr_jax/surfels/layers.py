@@ -76,8 +76,9 @@ class Constants:
     color_sigma: float = 0.1  # standard deviation for the similarity of two colors, in square roots of linear colors
     split_thickness: float = 0.02  # least thickness where colors separate two surfaces
     split_share: float = 0.3  # least share of certain points among the neighbors of similar color
-    # thresholds for possible and for certain splits: step over the thickness; share of the step's information that no
-    # slope or curvature explains; neighbors of each color; step over its standard error
+    # thresholds for possible and for certain splits: step over the thickness; tolerance of the step (1 / its variance
+    # inflation factor: about 1 - R^2 of its regression on slopes and curvatures); neighbors of each color; step over
+    # its standard error
     step_height: Pair = (1.5, 3.0)
     step_independence: Pair = (0.3, 0.7)
     step_points: Pair = (1.0, 2.0)
@@ -283,9 +284,16 @@ def fit_layers(
 ) -> tuple[Layer, SplitLayer | None]:
     """Layers from initial normals (fixed ones are kept), and split layers if a color distance is given.
 
-    A layer is a quadric through its point (Cazals and Pouget 2003).  For a split, the quadric is fitted again with one
-    more unknown: the step in height to the neighbors of another color.  A color edge on a curved surface is not a step:
-    slope and curvature explain it as well.  Blocks without mixed colors are not fitted again.
+    A layer is a quadric through its point (Cazals and Pouget 2003).  In the frame of the normal, neighbor j has the
+    tangent coordinates u, v and the height
+
+        h_j = s . (u, v) + q . (u^2, u v, v^2) + a c_j
+
+    with slopes s, curvatures q and, in a second fit for splits, the step a to the neighbors of another color (color
+    distance c_j in [0, 1]).  It is found by ridge regression, in rounds with the weights exp(-r_j^2 / (2 t^2)) of the
+    residuals r_j, with the thickness t.  A color edge on a curved surface is no step: slopes and curvatures explain it
+    as well.  Blocks without mixed colors are not fitted again.  Both fits are the body of one loop, which is compiled
+    once.
     """
     offset = jax.lax.optimization_barrier(hood.offset / spacing[None, None])
     weight, free = jax.lax.optimization_barrier((weight, 1 - fixed_normal.astype(weight.dtype)))
@@ -330,10 +338,7 @@ def _fit_quadric(
     least_thickness: Float[Array, " block"] | float,
     fit_slopes: Float[Array, " block"],
 ) -> QuadricFit:
-    """Fit in rounds; each weighs the neighbors by their height above the layer of the round before.
-
-    Neighbors of another color lie one step off the quadric.  With `fit_slopes` 0, the normals are kept.
-    """
+    """The rounds of a fit, with the step if a color distance is given.  With `fit_slopes` 0, the normals are kept."""
     ridge = _ridge(weight.dtype)[: len(initial.sums), : len(initial.sums)]
 
     def improve(_: Array, last: tuple[QuadricFit, Array]) -> tuple[QuadricFit, Array]:
@@ -368,7 +373,7 @@ def _ridge(dtype: jnp.dtype) -> Float[Array, "6 6 1"]:
 def _test_split(
     fit: QuadricFit, color_distance: Float[Array, "k block"]
 ) -> tuple[Bool[Array, " block"], Bool[Array, " block"]]:
-    """Whether the step separates two surfaces: possibly, and certainly."""
+    """Whether the step separates two surfaces: possibly, and certainly (the thresholds are CONSTANTS.step_...)."""
     step, own = fit.step, fit.weight
     last = jnp.zeros((6, 1, len(step)), step.dtype).at[-1].set(1)
     error = jnp.maximum(solve(fit.sums + _ridge(step.dtype), last)[-1, 0], 1e-9)

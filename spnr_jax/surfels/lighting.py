@@ -167,10 +167,10 @@ def reflect(light: Light, towards: list[Array], roughness: Array) -> list[Array]
 
 def reflectance(roughness: Array, cosine: Array) -> tuple[Array, Array]:
     """Scale and bias of the reflectance at normal incidence, integrated over the lobe (Karis' fit, 2014)."""
-    one = [r * s + o for r, s, o in ((roughness, -1, 1), (roughness, -0.0275, 0.0425))]
-    two = [r * s + o for r, s, o in ((roughness, -0.572, 1.04), (roughness, 0.022, -0.04))]
-    grazing = smaller(one[0] ** 2, 2.0 ** (-9.28 * cosine)) * one[0] + one[1]
-    return two[0] - 1.04 * grazing, two[1] + 1.04 * grazing
+    x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
+    z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
+    grazing = smaller(x * x, 2.0 ** (-9.28 * cosine)) * x + y
+    return z - 1.04 * grazing, w + 1.04 * grazing
 
 
 def gather_irradiance(surfels: Surfels, light: Light) -> Float[Array, "points 3"]:
@@ -182,7 +182,10 @@ def gather_irradiance(surfels: Surfels, light: Light) -> Float[Array, "points 3"
 
 
 def harmonics(x: Array, y: Array, z: Array) -> list[Array]:
-    """Real spherical harmonics of unit directions up to degree 2."""
+    """Real spherical harmonics of unit directions up to degree 2, without the Condon-Shortley phase.
+
+    Splats have that phase: gaussians.evaluate_harmonics.
+    """
     return [
         jnp.full_like(x, 0.282095),
         *(0.488603 * y, 0.488603 * z, 0.488603 * x),

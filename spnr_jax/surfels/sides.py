@@ -1,9 +1,10 @@
 """Which side of a surface is outside: visibility from fixed directions, votes of these and of thin walls.
 
 For each of 64 directions, the points are drawn into an orthographic depth buffer whose cells are CELL spacings wide:
-each point into the four cells around it, at the depth of its plane at the cell's centre.  A point is visible if, lifted
-off the surface by one spacing, it lies in front of the buffer.  Both depths are taken at the cell's centre, so a plane
-does not hide itself at any angle.  Visibility also gives ambient occlusion and the share of light that arrives.
+each point into the four cells around it, at the depth of its plane at the cell's centre.  A point is lifted off the
+surface by its spacing h; its visibility is then clip(1 - (buffer - depth) / h, 0, 1).  Both depths are taken at the
+cell's centre, so a plane does not hide itself at any angle.  Visibility also gives ambient occlusion and the share of
+light that arrives.
 
 Votes are pure functions of a block of points, the last axis.  A vote is positive if the normal points outward.  Votes
 flip a normal or keep it, and have no gradient.
@@ -62,7 +63,7 @@ def compute_visibility(
     *,
     grid: int,
 ) -> Float[Array, "64 points"]:
-    """Visibility of each point from each of DIRECTIONS: 1 in front, 0 from two spacings behind the depth buffer on.
+    """Visibility of each point from each of DIRECTIONS: 1 in front of the depth buffer, 0 two spacings behind it.
 
     Constant for gradients, because a depth buffer jumps where one point passes in front of another.  The sign of a
     normal does not matter.

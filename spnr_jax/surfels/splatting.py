@@ -2,9 +2,10 @@
 
     entry         a pair of a disc and a pixel that it covers (gsplat: intersection); entries are counted, made, and
                   sorted by pixel and depth
-    kernel        1 - r^2, where r is the distance from the disc's centre in its plane, over RADIUS spacings; a disc
-                  viewed edge-on or smaller than a pixel has a radius of MIN_RADIUS pixels (low-pass filter of EWA
-                  splatting, Zwicker et al. 2001); an entry's optical depth is proportional to the square of the kernel
+    kernel        k = clip(max(c - r^2, 1 - p^2), 0, 1): r is the distance from the disc's centre in its plane over RADIUS
+                  spacings, c falls from 1 to 0 at the disc's rims, and p is the distance from the projected centre over
+                  MIN_RADIUS pixels (low-pass filter of EWA splatting, Zwicker et al. 2001); an entry's optical depth
+                  is CENTRE_TAU k^2
     groups        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
                   occlude each other; from two spacings on, the front entry occludes the one behind
     blend weight  of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
@@ -46,7 +47,11 @@ MOST_COUNTED = 2**30  # largest count: sums of int32 overflow beyond twice that
 
 
 class Footprints(NamedTuple):
-    """Projection of each disc: camera coordinates, size, and its bounding rectangle of pixels."""
+    """Projection of each disc: camera coordinates, size, and its bounding rectangle of pixels.
+
+    `facing` in [0, 1] fades back faces; `column` and `row` are the projected centre in pixels, floats; `left`, `top`
+    and `width` describe the rectangle, which covers `covered` pixels.
+    """
 
     centre: tuple[Array, Array, Array]
     normal: tuple[Array, Array, Array]
@@ -61,9 +66,10 @@ class Footprints(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Pairs of disc and pixel.  `order` sorts by pixel and depth; `pixel`, `slot` and `rank` are already sorted.
+    """Pairs of disc and pixel: `point`, `kernel`, `depth` and `facing` by disc; the other fields by pixel and depth.
 
-    A slot is the index of a covered pixel, a rank the position of an entry in its slot's list.
+    The i-th entry by pixel and depth is number order[i] by disc; it lies in a pixel, which is the slot-th covered one,
+    and has a rank in the list of its slot.
     """
 
     point: Int[Array, " entries"]
@@ -306,7 +312,8 @@ def _sum_colors(
 ) -> Float[Array, "slots 5"]:
     """Weighted sums of the discs' colours where the ray meets the surface, and of the discs' centres.
 
-    Rows are those of `_gather_colors`.  A color edge is antialiased over one pixel.
+    Rows: the 10 columns of `_gather_colors`, then column and row of the disc's centre in pixels.  A color edge is
+    antialiased over one pixel.
     """
     right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
     up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
@@ -352,9 +359,15 @@ def _plain_blend_weights(tau: Array, depth: Array, spacing: Array) -> tuple[Arra
 def _pull_back_blend_weights(
     primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
 ) -> tuple[Array, Array, Array]:
-    """Gradients by tau, depth and spacing; each pair of entries contributes to both.
+    """Gradients by tau, depth and spacing; `by_x` is the gradient by x.
 
-    The gradient that JAX derives takes twenty times as long as the weights themselves.
+    With the occlusion o_ij of i by j, 0 if they are in one group and 1 if j is two spacings in front, and
+    m(t) = (1 - exp(-t)) / t, the weights are
+
+        T_i = exp(-sum_j o_ij tau_j),    a_i = tau_i T_i m(sum_j (1 - o_ij) tau_j).
+
+    Each pair of entries contributes to both of its members.  The gradient that JAX derives takes twenty times as long
+    as the weights.
     """
     tau, depth, spacing = primals
     by_weight, by_transmittance = cotangents

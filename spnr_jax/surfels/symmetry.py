@@ -40,18 +40,18 @@ UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected 
 
 
 class Limits(NamedTuple):
-    """Limits of the distance from a reflected point to the nearest measured one; `most_points` of a completed cloud.
-
-    Up to a mean of `fits` over a neighborhood its points fit.  A reflected point is kept between `nearest`, which is
-    also the least distance between two of them, and `farthest`.  Where nine tenths of the points lie within `plate` of
-    a plane, it is the middle of a plate, which any points fit.
-    """
+    """Limits of distances, in spacings, from a reflected point to the nearest measured one."""
 
     fits: float
+    """A neighborhood fits if its mean distance is below this."""
     nearest: float
+    """Reflected points nearer than this are left out; also the least distance between two of them."""
     farthest: float
+    """Reflected points farther than this are left out."""
     plate: float
+    """A plane within this distance of nine tenths of the points is the middle of a plate, which proves no symmetry."""
     most_points: int
+    """Larger clouds are left as they are."""
 
 
 # other points of the surface have a mean distance of 0.37 if they are even, 0.5 if random
@@ -73,7 +73,8 @@ class Surface(NamedTuple):
 class Reflection(NamedTuple):
     """Points reflected in the plane normal . x = offset, each with the measured point that it matches.
 
-    `distance` is that to the nearest measured point; height over the plane of the match and cosine of the normals.
+    `height` over the plane of the match and `distance` to the nearest measured point, in spacings; `cosine` between the
+    normals.
     """
 
     position: Float[np.ndarray, "n 3"]
@@ -85,9 +86,10 @@ class Reflection(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """The points x with normal . x = offset; `distance` is the mean from reflected points to the nearest measured one.
+    """The points x with normal . x = offset.
 
-    `share` of the points have reflected ones around them that lie as near as other points of the surface would.
+    `distance`: mean distance from reflected points to the nearest measured one.  `share`: share of the points whose
+    neighborhood fits.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -224,7 +226,10 @@ def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointClo
 def space_out(
     position: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, " n"], least: float
 ) -> Int[np.ndarray, " kept"]:
-    """Indices of points, those of the largest distance first, without those closer than `least` to one before."""
+    """Greedy thinning: visits points by decreasing distance, keeps those farther than `least` from all kept ones.
+
+    Returns sorted indices.
+    """
     near, free = cKDTree(position).query_ball_point(position, least), np.ones(len(position), bool)
     kept = np.zeros(len(position), bool)
     for point in np.argsort(-distance, kind="stable"):

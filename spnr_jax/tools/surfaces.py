@@ -1,10 +1,9 @@
-"""The surface that a network's pictures from all around show: depth, Gaussian splats.
+"""The surface in a network's pictures: its depth, and Gaussian splats on it.
 
-A rendering's depth is the mean distance of all the light of a ray, and what passes by counts with the far side of the
-box.  At silhouettes this lies behind the object.  Here what passes is taken out again, and pixels that let most of the
-light pass have no depth.
+Rendering.depth is sum_i w_i t_i + (1 - acc) t_far, with the far side of the box: behind the object at silhouettes.
+`surface_depth` solves for sum_i w_i t_i / acc; pixels with acc < HIT have none.
 
-Splats (surfels/gaussians.py) are placed on this surface and coloured from the pictures.
+Splats (surfels/gaussians.py) are placed on this surface and coloured from pictures all around.
 """
 
 import dataclasses

@@ -14,7 +14,7 @@ import dataclasses
 import hashlib
 import json
 import zlib
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -341,10 +341,10 @@ def mirror(view: Arrays, axis: int) -> Arrays:
     flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
     return {
         **flipped,
-        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.ODD[axis]),
+        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.find_odd_inputs(axis)),
         "ambient": view["ambient"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
     }
 
 
-def _signs(count: int, odd: tuple[int, ...]) -> Float[np.ndarray, " count"]:
+def _signs(count: int, odd: Sequence[int]) -> Float[np.ndarray, " count"]:
     return np.where(np.isin(np.arange(count), odd), -1, 1).astype(np.float32)

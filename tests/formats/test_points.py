@@ -152,6 +152,7 @@ TEXTS = {
     "ASCII PCD, packed colours as whole numbers of a float": ("a.pcd", PCL + table(" ", columns=OPAQUE)),
     "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
     "grey: UTF-16 OBJ": ("a.obj", POINT_LINES.encode("utf-16")),
+    "grey: OFF without its word": ("a.off", "420 0 0\n" + table(" ", columns=POINTS)),
     "grey: OFF with a byte order mark": ("a.off", "\ufeffOFF\n420 0 0\n" + table(" ", columns=POINTS)),
     "grey: PLY with a byte order mark": ("a.ply", BOM_UTF8 + ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
