@@ -35,7 +35,7 @@ NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
 ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
 LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
-TANGENT_DIRECTIONS = 6  # tested for openness in each tangent plane; the first points to the nearest neighbor
+ANGLES = 2 * np.pi / 6 * np.arange(6)  # of the directions tested for openness, from that to the nearest neighbor
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
 OPEN_DISTANCE = 0.5  # spacings from a point to its open place
 AFTER_PAIRS = 1e3  # rank of an open place: above the length of any pair in spacings
@@ -101,55 +101,92 @@ def describe_nodes(surfels: Surfels) -> Nodes:
     return Nodes(position, normal, spacing, safe_sqrt(color), traits)
 
 
+class Pairs(NamedTuple):
+    """Each point i beside each of its neighbors j."""
+
+    other: Int[Array, "n k"]
+    """Index of j, negative for none."""
+    real: Bool[Array, "n k"]
+    offset: Float[Array, "n k 3"]
+    """From i to j; 0 for none."""
+    size: Float[Array, "n k"]
+    """Length of the offset."""
+    tangent: Float[Array, "n k 3"]
+    """Unit direction of j in the tangent plane of i."""
+    crosses_wall: Bool[Array, "n k"]
+    """Whether the pair is steep to both tangent planes."""
+    bent: Bool[Array, "n k"]
+    """Whether the surface bends between i and j, or one of them lies on a thin wall."""
+
+
+def describe_pairs(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Pairs:
+    """The geometry of all pairs of a point and a neighbor."""
+    other = neighbors[:, 1:]
+    real, spacing = other >= 0, nodes.spacing[:, None]
+    offset = jnp.where(real[..., None], nodes.position[other] - nodes.position[:, None], 0)
+    size = safe_sqrt(jnp.sum(offset**2, axis=-1))
+    height = jnp.einsum("nai,ni->na", offset, nodes.normal)
+    height_there = jnp.sum(offset * nodes.normal[other], axis=-1)
+    crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(height_there) > ACROSS * size)
+    cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
+    bent = (jnp.abs(height) + jnp.abs(height_there)) / spacing + 1 - cosine > BENT
+    opposed = jnp.sum(real & (cosine < OPPOSED_COSINE), axis=1)
+    on_wall = opposed > WALL_SHARE * jnp.sum(real, axis=1)  # pairs across a wall would fill one side of it alone
+    bent = bent | on_wall[:, None] | on_wall[other]
+    tangent = normalize((offset - height[..., None] * nodes.normal[:, None]) / spacing[..., None])
+    return Pairs(other, real, offset, size, tangent, crosses_wall, bent)
+
+
+def find_blocked(pairs: Pairs) -> Bool[Array, "n k"]:
+    """Whether another neighbor lies between the two ends: it sees them at a cosine below -BETWEEN (113.6 degrees).
+
+    The pairs that are not blocked are those of a beta-skeleton; a Gabriel graph has 90 degrees.
+    """
+    products = jnp.einsum("nai,nbi->nab", pairs.offset, pairs.offset, precision="highest")
+    squared = jnp.diagonal(products, axis1=1, axis2=2)
+    to_end = safe_sqrt(squared[:, :, None] + squared[:, None] - 2 * products)
+    between = squared[:, None] - products < -BETWEEN * pairs.size[:, None] * to_end
+    return jnp.any(between & (pairs.real & ~pairs.crosses_wall)[:, None], axis=2)
+
+
+def find_open_directions(nodes: Nodes, pairs: Pairs) -> tuple[Float[Array, "n 6 3"], Bool[Array, "n 6"]]:
+    """Directions in each tangent plane, the first towards the nearest neighbor, and which have no near neighbor."""
+    joined = pairs.real & ~pairs.crosses_wall
+    nearest = jnp.argmin(jnp.where(joined, pairs.size, jnp.inf), axis=1)[:, None, None]
+    first = project_to_tangent(jnp.take_along_axis(pairs.tangent, nearest, axis=1)[:, 0], nodes.normal)
+    second = jnp.cross(nodes.normal, first)
+    directions = first[:, None] * np.cos(ANGLES)[None, :, None] + second[:, None] * np.sin(ANGLES)[None, :, None]
+    cosine = jnp.einsum("nwi,nai->nwa", directions, pairs.tangent)
+    closed = (cosine > BESIDE) & (joined & (pairs.size < NEAR * nodes.spacing[:, None]))[:, None]
+    return directions, ~jnp.any(closed, axis=2) & pairs.real[:, :1]
+
+
 def propose(
     nodes: Nodes, neighbors: Int[Array, "n 20"]
 ) -> tuple[Int[Array, "n c"], Bool[Array, "n c"], Float[Array, "n c 3"]]:
     """For each point: the other ends of its pairs, which of them exist, and directions to open places (end: the point).
 
-    Pairs are the edges of a beta-skeleton: no other neighbor sees the two ends at an angle above 113.6 degrees (cosine
-    below -BETWEEN; a Gabriel graph has 90 degrees).  A pair that is in the lists of both ends belongs to one of them,
-    the lower or the higher index by the parity of their sum, so that all points own about as many.  Each point has
-    CANDIDATES slots: its pairs by length, then open directions by angle.
+    A pair that is in the lists of both ends belongs to one of them, the lower or the higher index by the parity of
+    their sum, so that all points own about as many.  The CANDIDATES slots of a point hold its pairs by length, then
+    open directions by angle.
     """
-    own = jnp.arange(len(neighbors), dtype=neighbors.dtype)
-    other = neighbors[:, 1:]
-    real, reach = other >= 0, nodes.spacing[:, None]
-    offset = jnp.where(real[..., None], nodes.position[other] - nodes.position[:, None], 0)
-    products = jnp.einsum("nai,nbi->nab", offset, offset, precision="highest")
-    squared = jnp.diagonal(products, axis1=1, axis2=2)
-    to_end = safe_sqrt(squared[:, :, None] + squared[:, None] - 2 * products)
-    size = safe_sqrt(squared)
-    height = jnp.einsum("nai,ni->na", offset, nodes.normal)
-    there = jnp.sum(offset * nodes.normal[other], axis=-1)
-    crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(there) > ACROSS * size)
-    cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
-    bent = (jnp.abs(height) + jnp.abs(there)) / reach + 1 - cosine > BENT
-    opposed = jnp.sum(real & (cosine < OPPOSED_COSINE), axis=1)
-    walled = opposed > WALL_SHARE * jnp.sum(real, axis=1)  # pairs across a wall would fill one side of it alone
-    bent = bent | walled[:, None] | walled[other]
-    sparse = jnp.sum(neighbors[:, 0] >= 0) <= SPARSE
-    between = squared[:, None] - products < -BETWEEN * size[:, None] * to_end
-    blocked = jnp.any(between & (real & ~crosses_wall)[:, None], axis=2)
-    listed = jnp.any(neighbors[other] == own[:, None, None], axis=-1)
+    pairs = describe_pairs(nodes, neighbors)
+    own, other, spacing = jnp.arange(len(neighbors), dtype=neighbors.dtype), pairs.other, nodes.spacing[:, None]
+    mutual = jnp.any(neighbors[other] == own[:, None, None], axis=-1)
     owns = ((own[:, None] + other) % 2 == 0) == (own[:, None] < other)
-    fits = (size < LONGEST * reach) & (size > SHORTEST * (reach + nodes.spacing[other]))
-    pair = real & ~blocked & ~crosses_wall & (owns | ~listed) & fits & (sparse | bent)
-    flat = normalize((offset - height[..., None] * nodes.normal[:, None]) / reach[..., None])
-    nearest = jnp.argmin(jnp.where(real & ~crosses_wall, size, jnp.inf), axis=1)[:, None, None]
-    first = project_to_tangent(jnp.take_along_axis(flat, nearest, axis=1)[:, 0], nodes.normal)
-    second = jnp.cross(nodes.normal, first)
-    angle = 2 * np.pi / TANGENT_DIRECTIONS * np.arange(TANGENT_DIRECTIONS)
-    directions = first[:, None] * np.cos(angle)[None, :, None] + second[:, None] * np.sin(angle)[None, :, None]
-    along = jnp.einsum("nwi,nai->nwa", directions, flat)
-    closed = (along > BESIDE) & (real & ~crosses_wall & (size < NEAR * reach))[:, None]
-    free = ~jnp.any(closed, axis=2) & real[:, :1]
-    ranks = jnp.where(pair, size / reach, jnp.inf), jnp.where(free, AFTER_PAIRS + angle[None], jnp.inf)
-    rank = jnp.concatenate(ranks, axis=1)
+    fits = (pairs.size < LONGEST * spacing) & (pairs.size > SHORTEST * (spacing + nodes.spacing[other]))
+    sparse = jnp.sum(neighbors[:, 0] >= 0) <= SPARSE
+    joined = pairs.real & ~find_blocked(pairs) & ~pairs.crosses_wall & fits
+    chosen = joined & (owns | ~mutual) & (sparse | pairs.bent)
+    directions, free = find_open_directions(nodes, pairs)
+    by_length = jnp.where(chosen, pairs.size / spacing, jnp.inf)
+    by_angle = jnp.where(free, AFTER_PAIRS + ANGLES[None], jnp.inf)
+    rank = jnp.concatenate([by_length, by_angle], axis=1)
     order = jnp.argsort(rank, axis=1)[:, :CANDIDATES]
     exists = jnp.take_along_axis(rank, order, axis=1) < jnp.inf
     ends = jnp.concatenate([other, jnp.broadcast_to(own[:, None], free.shape)], axis=1)
     ends = jnp.where(exists, jnp.take_along_axis(ends, order, axis=1), own[:, None])
-    directions = jnp.concatenate([flat, directions], axis=1)
+    directions = jnp.concatenate([pairs.tangent, directions], axis=1)
     return ends, exists, jnp.take_along_axis(directions, order[..., None], axis=1)
 
 
@@ -362,8 +399,9 @@ def select_points(
 ) -> Bool[Array, " m"]:
     """Which predicted points are kept: likely ones that are not too close to each other or to a measured point.
 
-    Of two rivals, the one that is more likely and farther from measured points wins.  Each round keeps the points
-    that beat all their rivals (maximal independent set, Luby 1986), so the order of points does not matter.
+    Of two candidates that are too close, the one that is more likely and farther from measured points wins.  Each round
+    keeps those that beat all others close to them (maximal independent set, Luby 1986), so the order of points does not
+    matter.  The candidates of point i have the indices i * CANDIDATES + c.
     """
     count = len(neighbors)
     near = neighbors[:, :12]
@@ -382,18 +420,18 @@ def select_points(
     gap = jnp.min(measured, axis=2)
     likely = jax.nn.sigmoid(learned.logit).reshape(count, CANDIDATES)
     candidate = exists.reshape(count, CANDIDATES) & (likely > LEAST_PROBABILITY) & (gap > 1)
-    worth = jnp.where(candidate, likely * jnp.minimum(gap, LARGEST_GAP), 0)
-    number = (near[..., None] * CANDIDATES + jnp.arange(CANDIDATES)[None, None]).reshape(count, 1, -1)
+    score = jnp.where(candidate, likely * jnp.minimum(gap, LARGEST_GAP), 0)
+    candidate_index = (near[..., None] * CANDIDATES + jnp.arange(CANDIDATES)[None, None]).reshape(count, 1, -1)
     own = jnp.arange(count * CANDIDATES).reshape(count, CANDIDATES, 1)
-    rivals = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3)) < 1
-    rivals = rivals & (number != own) & jnp.repeat(near >= 0, CANDIDATES, axis=1)[:, None]
-    other = worth.reshape(-1)[number]
-    better = rivals & ((other > worth[..., None]) | ((other == worth[..., None]) & (number < own)))
+    too_close = compare(position[near].reshape(count, -1, 3), normal[near].reshape(count, -1, 3)) < 1
+    too_close = too_close & (candidate_index != own) & jnp.repeat(near >= 0, CANDIDATES, axis=1)[:, None]
+    other = score.reshape(-1)[candidate_index]
+    loses = too_close & ((other > score[..., None]) | ((other == score[..., None]) & (candidate_index < own)))
 
     def decide(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         kept, undecided = state
-        best = undecided & ~jnp.any(better & undecided.reshape(-1)[number], axis=2)
-        lost = jnp.any(rivals & best.reshape(-1)[number], axis=2)
+        best = undecided & ~jnp.any(loses & undecided.reshape(-1)[candidate_index], axis=2)
+        lost = jnp.any(too_close & best.reshape(-1)[candidate_index], axis=2)
         return kept | best, undecided & ~best & ~lost
 
     return jax.lax.fori_loop(0, ROUNDS, decide, (jnp.zeros_like(candidate), candidate))[0].reshape(-1)

@@ -2,10 +2,10 @@
 
     entry         a pair of a disc and a pixel that it covers (gsplat: intersection); entries are counted, made, and
                   sorted by pixel and depth
-    kernel        k = clip(max(c - r^2, 1 - p^2), 0, 1): r is the distance from the disc's centre in its plane over RADIUS
-                  spacings, c falls from 1 to 0 at the disc's rims, and p is the distance from the projected centre over
-                  MIN_RADIUS pixels (low-pass filter of EWA splatting, Zwicker et al. 2001); an entry's optical depth
-                  is CENTRE_TAU k^2
+    kernel        k = clip(max(c - r^2, 1 - p^2), 0, 1): r is the distance from the disc's centre in its plane, over
+                  RADIUS spacings; c falls from 1 to 0 at the disc's rims; p is the distance from the projected centre,
+                  over MIN_RADIUS pixels (low-pass filter of EWA splatting, Zwicker et al. 2001).  The optical depth of
+                  an entry is CENTRE_TAU k^2
     groups        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
                   occlude each other; from two spacings on, the front entry occludes the one behind
     blend weight  of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
@@ -361,10 +361,9 @@ def _pull_back_blend_weights(
 ) -> tuple[Array, Array, Array]:
     """Gradients by tau, depth and spacing; `by_x` is the gradient by x.
 
-    With the occlusion o_ij of i by j, 0 if they are in one group and 1 if j is two spacings in front, and
-    m(t) = (1 - exp(-t)) / t, the weights are
+    With o_ij = 1 for entries of one group, falling to 0 for separate ones, and m(t) = (1 - exp(-t)) / t, the weights are
 
-        T_i = exp(-sum_j o_ij tau_j),    a_i = tau_i T_i m(sum_j (1 - o_ij) tau_j).
+        T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(tau_i + sum_j o_ij tau_j).
 
     Each pair of entries contributes to both of its members.  The gradient that JAX derives takes twenty times as long
     as the weights.
