@@ -361,7 +361,8 @@ def _pull_back_blend_weights(
 ) -> tuple[Array, Array, Array]:
     """Gradients by tau, depth and spacing; `by_x` is the gradient by x.
 
-    With o_ij = 1 for entries of one group, falling to 0 for separate ones, and m(t) = (1 - exp(-t)) / t, the weights are
+    With o_ij = 1 for entries of one group, falling to 0 for separate ones, and m(t) = (1 - exp(-t)) / t, the weights
+    are
 
         T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(tau_i + sum_j o_ij tau_j).
 
