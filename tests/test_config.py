@@ -54,13 +54,6 @@ def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, fie
     assert str(value) in str(error.value)
 
 
-def test_an_unknown_word_names_the_known_ones():
-    config = EncoderConfig()
-    object.__setattr__(config, "inputs", "none")  # the tests' type checker would be quicker than the config
-    with pytest.raises(ValueError, match="inputs must be plain or spread, got none"):
-        config.__post_init__()
-
-
 OWN = [name for name in PRESETS if PRESETS[name].__module__ == "spnr_jax.presets"]  # other tests add to them
 
 
@@ -101,6 +94,7 @@ class TestOfAFile:
             ("encoder", {"base_width": 16.0}, "base_width must be a whole number"),
             ("encoder", {"materials": [["a"]]}, "materials must be base_color, roughness or metallic"),
             ("encoder", {"point_widths": 8}, "point_widths must be several values"),
+            ("encoder", {"inputs": "none"}, "inputs must be plain or spread, got 'none'"),
             (None, {"field_width": True}, "field_width"),
             (None, {"sees_direction": 1}, "sees_direction must be true or false"),
             (None, {"precision": None}, "precision"),
