@@ -197,7 +197,7 @@ def to_dict(config: TrainConfig) -> dict:
     return values | {"model": named | values["model"]}
 
 
-def from_dict(values: Any, kind: type = TrainConfig, path: str = "") -> Any:
+def from_dict(values: Any, kind: Any = TrainConfig, path: str = "") -> Any:
     """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
     place = f"config field {path[:-1]}" if path else "the config"
     require(isinstance(values, dict), f"{place} holds {values!r}, which is no JSON object")
