@@ -35,13 +35,9 @@ def check(config: Any, positive: Collection[str] = (), shares: Collection[str] =
     of: Any = type(config)
     for name, kind in types_of(of).items():
         value = getattr(config, name)
-        words = mismatch(value, kind)
-        words = words.replace("at least 0", "above 0") if name in positive else words
-        if not words and name in positive:
-            values = value if isinstance(value, tuple) else (value,)
-            words = "" if all(x > 0 for x in values) else "positive"
-        if not words and name in shares:
-            words = "" if value <= 1 else "a share, 0 to 1"
+        words = mismatch(value, kind, name in positive)
+        if not words and name in shares and value > 1:
+            words = "a share, 0 to 1"
         require(not words, f"{name} must be {words}, got {value}")
 
 
@@ -52,18 +48,19 @@ def types_of(kind: Any) -> dict[str, Any]:
     return {f.name: known[f.name] for f in dataclasses.fields(kind)}
 
 
-def mismatch(value: Any, kind: Any) -> str:
-    """What the value should have been, by its type; empty if it fits.  An integer fits a float."""
+def mismatch(value: Any, kind: Any, positive: bool = False) -> str:
+    """What the value should have been, by its type; empty if it fits.  An integer fits a float, 0 unless `positive`."""
     origin, inside = get_origin(kind), get_args(kind)
     if origin is Literal:
         return "" if isinstance(value, str) and value in inside else " or ".join([", ".join(inside[:-1]), inside[-1]])
     if origin is tuple:
         if not isinstance(value, tuple):
             return "several values"
-        return next(filter(None, (mismatch(x, inside[0]) for x in value)), "")
+        return next(filter(None, (mismatch(x, inside[0], positive) for x in value)), "")
     if kind in (int, float):
         fits = isinstance(value, int | kind) and not isinstance(value, bool) and 0 <= value < LARGEST
-        return "" if fits else {int: "a whole number, at least 0", float: "a number, at least 0"}[kind]
+        what = "a whole number" if kind is int else "a number"
+        return "" if fits and (value or not positive) else f"{what}, {'above' if positive else 'at least'} 0"
     return "" if isinstance(value, kind) else "true or false" if kind is bool else f"of the type {kind.__name__}"
 
 

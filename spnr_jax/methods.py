@@ -110,7 +110,8 @@ METHODS: dict[str, Method] = {
 }
 
 
-REMOVED_FIELD = "trains"  # a field of earlier versions that weights files still contain
+# what files hold beside the fields of a config: one of earlier versions, and how a network's class is found
+EXTRA_FIELDS: dict[type, tuple[str, ...]] = {TrainConfig: ("trains",), NetworkConfig: ("method", "source")}
 
 
 class UnknownMethod(UserError):
@@ -196,21 +197,22 @@ def to_dict(config: TrainConfig) -> dict:
     return values | {"model": named | values["model"]}
 
 
-def from_dict(values: dict, kind: type = TrainConfig, path: str = "") -> Any:
+def from_dict(values: Any, kind: Any = TrainConfig, path: str = "") -> Any:
     """A training config from `to_dict`'s form; ValueError with the path of an unknown, missing or mistyped field."""
+    place = f"config field {path[:-1]}" if path else "the config"
+    require(isinstance(values, dict), f"{place} holds {values!r}, which is no JSON object")
+    extra = EXTRA_FIELDS.get(kind, ())
+    if kind is NetworkConfig:
+        kind = _find_config_class(values.get("method"), values.get("source"), path)
     kinds = types_of(kind)
-    values = {name: value for name, value in values.items() if f"{path}{name}" != REMOVED_FIELD}
     for name in values:
-        require(name in kinds, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
+        known = name in kinds or name in extra
+        require(known, f"unknown config field {path}{name}; known: {', '.join(kinds)}")
     arguments = {}
     for name, expected in kinds.items():
         require(name in values, f"config field {path}{name} is missing")
         value = values[name]
         if dataclasses.is_dataclass(expected):
-            require(isinstance(value, dict), f"config field {path}{name} holds {value!r}, which is no JSON object")
-            if expected is NetworkConfig:
-                expected = _find_config_class(value.get("method"), value.get("source"), path)
-                value = {field: inner for field, inner in value.items() if field not in ("method", "source")}
             value = from_dict(value, expected, f"{path}{name}.")
         value = tuple(value) if isinstance(value, list) else value
         words = mismatch(value, expected)
@@ -224,4 +226,4 @@ def _find_config_class(name: Any, source: Any, path: str) -> type[NetworkConfig]
     if isinstance(name, str) and name in METHODS:
         return METHODS[name].config
     named = f"--methods {source}, or load(..., methods={source!r})" if source else "--methods and its file"
-    raise UnknownMethod(f"{path}model.method {name} is not one of {', '.join(METHODS)}; for another give {named}")
+    raise UnknownMethod(f"{path}method {name} is not one of {', '.join(METHODS)}; for another give {named}")

@@ -24,9 +24,8 @@ exit_code = partial(command_line.exit_code, cli)
 
 @pytest.fixture(autouse=True)
 def shrunken(monkeypatch):
-    """The preset `tiny` is the tests' network, and nothing is written to the home folder."""
+    """The preset `tiny` is the tests' network."""
     monkeypatch.setitem(presets.PRESETS, "tiny", lambda: tiny_untrained.CONFIG)
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
 
 
 @pytest.fixture
@@ -62,8 +61,7 @@ REFUSED = [  # command, what its line says
     ("train missing new", "run `spnr-data generate missing`"),
     ("evaluate missing RUN", "spnr-data generate"),
     ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate"),
-    ("evaluate DATA .", "not a run folder"),
-    ("render three.xyz --run .", "not a run folder"),
+    ("evaluate DATA .", "not a run folder (config.json is missing); train one with `spnr train DATA"),
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
     ("render noise.npz --run RUN", "noise.npz"),
     ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
@@ -156,7 +154,7 @@ SETTING_UP = """
 import sys
 import jax
 from spnr_jax import cli; from spnr_jax.devices import runtime
-runtime.keep_freed_memory = lambda: print("kept", end=" ")
+runtime.call_libc = lambda name, *_: print(name, end=" ")
 cli.RUN = dict.fromkeys(cli.RUN, lambda command: None)
 for line in sys.argv[1:]:
     jax.config.update("jax_cpu_enable_async_dispatch", True)
@@ -174,7 +172,8 @@ def test_memory_is_kept_where_work_repeats_itself_and_compilations_always(tmp_pa
         text=True,
     )
     cache = tmp_path / below
-    assert said.splitlines() == [f"True {cache}", f"kept False {cache}", f"kept False {cache}"]
+    kept = f"mallopt mallopt False {cache}"
+    assert said.splitlines() == [f"True {cache}", kept, kept]
 
 
 @pytest.mark.parametrize("form", [["--preset", "small"], ["--preset=small"]])
@@ -259,22 +258,15 @@ def test_a_cloud_gets_learned_points_unless_they_are_declined(tmp_path, monkeypa
 
 
 @pytest.mark.ci
-def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture_of_the_newest_whole_checkpoint(
-    capsys, tmp_path, data
-):
+def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture(capsys, tmp_path, data):
     run = tmp_path / "run"
     assert exit_code("train", data, run, "--log-every", 2, "--checkpoint-every", 4) == 0
     assert f"spnr evaluate {data} {run}" in capsys.readouterr().out
     assert exit_code("evaluate", data, run, "--gallery", 1, "--out", tmp_path / "scores") == 0
-    for path in (run / "checkpoints" / "6").rglob("*"):
-        if path.is_file():
-            path.write_bytes(b"")
     np.savetxt(tmp_path / "one.xyz", np.eye(4)[:, :3])
     arguments = ("--run", run, "--out", tmp_path, "--views", 1, "--turntable", "none", "--resolution", 24)
     assert exit_code("render", tmp_path / "one.xyz", *arguments) == 0
-    captured = capsys.readouterr()
-    assert "3 objects of the test split\n" in captured.out
-    assert "trying the one before" in captured.out + captured.err
+    assert "3 objects of the test split\n" in capsys.readouterr().out
     assert (tmp_path / "one_000.png").is_file()
     metrics = json.loads((tmp_path / "scores" / "metrics.json").read_text())
     assert set(metrics["seconds"]) == {"evaluate", "total"}

@@ -29,7 +29,6 @@ def forget(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def fresh(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     forget(monkeypatch)
 
 
@@ -40,7 +39,6 @@ def run(tmp_path_factory):
     (folder / "my_method.py").write_text(SOURCE)
     with pytest.MonkeyPatch.context() as patch:
         forget(patch)
-        patch.setattr(cli, "set_up_jax", lambda **_: None)
         patch.chdir(folder)
         data = tiny_dataset.dataset().folder
         asked = ("train", data, "run", "--methods", "my_method.py", "--preset", "mean_color")

@@ -48,7 +48,7 @@ def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
     show = evaluation.make_method(variables, training)
     return Method(
-        draw=lambda _, item: show(item.cloud, item.camera),
+        draw=lambda _, item: show(item),
         compiles=True,
         has_opacity=training.model.method != "npbg",
     )
@@ -85,7 +85,7 @@ def of_floor(name: str, factor: float) -> Method:
     """A trivial renderer with the radius of its points, in point spacings."""
     show = evaluation.make_floor(name, factor)
     return Method(
-        draw=lambda _, item: show(item.cloud, item.camera),
+        draw=lambda _, item: show(item),
         compiles=True,
         has_opacity=name != "white",
         radius=None if name == "white" else factor,

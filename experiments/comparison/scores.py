@@ -6,7 +6,6 @@
 `score_objects` is the same for methods whose pictures are scored as `spnr evaluate` scores them, in memory.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -187,11 +186,10 @@ def score_objects(
     `more` scores a method's pictures of an object in other ways, too.
     """
     seconds: dict[str, list[float]] = {method: [] for method in methods}
+    shows = {label: time_views(method, seconds[label]) for label, method in methods.items()}
     scores, shown, to_show = {}, [], evaluation.pick_evenly(names, num_shown)
     for name in tqdm(names, desc="scoring"):
         item = data_sets.read_object(dataset, name)
-        item = dataclasses.replace(item, cloud=data_sets.first_points(item, config.test_points))
-        shows = {label: time_views(method, item, seconds[label]) for label, method in methods.items()}
         result = evaluation.evaluate_object(shows, config, item)
         for label, pictures in result.pictures.items():
             if not methods[label].has_opacity and label not in evaluation.FLOORS:
@@ -204,10 +202,10 @@ def score_objects(
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
-def time_views(method: Method, item: ObjectData, seconds: list[float]) -> evaluation.Method:
-    """The method bound to an object, noting the seconds per view until the pictures lie on the host."""
+def time_views(method: Method, seconds: list[float]) -> evaluation.Method:
+    """The method, noting the seconds per view until the pictures lie on the host."""
 
-    def measured(*_: object) -> Pictures:
+    def measured(item: ObjectData) -> Pictures:
         start = time.monotonic()
         pictures = method.show(item)
         seconds.append((time.monotonic() - start) / len(pictures.image))

@@ -92,7 +92,6 @@ def split_objects(function: Callable[..., Any], whole: Any, *parts: Any) -> Any:
 
 
 DIGEST = hashlib.sha256().digest_size
-_registered: set[type] = set()
 
 
 class CachedProgram:
@@ -194,11 +193,9 @@ def _digest_sources() -> bytes:
     return found.digest()
 
 
+@functools.cache  # twice is an error
 def _register(record: type) -> None:
-    """Registers a record with `jax.export`, once."""
-    if record in _registered:
-        return
-    _registered.add(record)
+    """Registers a record with `jax.export`."""
     name = f"{record.__module__}.{record.__qualname__}"
     if issubclass(record, tuple):
         export.register_namedtuple_serialization(record, serialized_name=name)

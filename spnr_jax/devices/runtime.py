@@ -62,13 +62,8 @@ def reuse_memory() -> None:
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    keep_freed_memory()
-
-
-def keep_freed_memory() -> None:
-    """Keeps freed memory in the process until it is trimmed."""
-    _call_libc(lambda libc: libc.mallopt(MMAP_MAX, 0))
-    _call_libc(lambda libc: libc.mallopt(TRIM_THRESHOLD, 2**31 - 1))
+    call_libc("mallopt", MMAP_MAX, 0)
+    call_libc("mallopt", TRIM_THRESHOLD, 2**31 - 1)  # freed memory stays until `trim_memory`
 
 
 def limit_arenas() -> None:
@@ -77,19 +72,18 @@ def limit_arenas() -> None:
     Each batch, row and checkpoint is made by new threads; with an arena for each, freed memory would stay scattered
     over all of them.  With fewer arenas than cores, the threads of one step would wait for each other.
     """
-    _call_libc(lambda libc: libc.mallopt(ARENA_MAX, os.cpu_count() or 1))
+    call_libc("mallopt", ARENA_MAX, os.cpu_count() or 1)
 
 
 def trim_memory() -> None:
     """Returns freed memory to the system; otherwise glibc keeps 130 MB after Orbax saves, and more each time."""
-    _call_libc(lambda libc: libc.malloc_trim(0))
+    call_libc("malloc_trim", 0)
 
 
-def _call_libc(what: Callable[[ctypes.CDLL], int]) -> None:
-    try:
-        what(ctypes.CDLL("libc.so.6"))
-    except (OSError, AttributeError):
-        return  # another C library
+def call_libc(name: str, *arguments: int) -> None:
+    """Calls a function of glibc; does nothing with another C library."""
+    with suppress(OSError, AttributeError):
+        getattr(ctypes.CDLL("libc.so.6"), name)(*arguments)
 
 
 # --- programs on the disk ---------------------------------------------------------------------------------------------
@@ -103,18 +97,14 @@ QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 CHECK_MARK = "looked-at"  # file whose modification time tells which entries were checked: all older ones
 
 
-def cache_folder() -> Path:
-    """Folder of this user's cached files."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spnr_jax"
-
-
 def cache_programs() -> None:
     """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
     hide_false_alarms()
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(caches / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
     with suppress(OSError):  # there is none yet, or it is not ours to mend
         remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))

@@ -1,7 +1,7 @@
 """Scores of methods on a split of a data set: a network beside the trivial renderers that every table shows.
 
-A method is a function that shows a cloud to cameras (`Method`); all of them see the same points and cameras, and are
-scored by the same metrics.
+A method is a function that draws the views of an object from its points (`Method`); all of them see the same points and
+cameras, and are scored by the same metrics.
 
     white      an empty picture
     splat      every point a disc of `radius` that faces the camera (parallel to the image plane)
@@ -55,7 +55,7 @@ class Pictures:
     depth: np.ndarray | Array | None = None
 
 
-Method = Callable[[PointCloud, Camera], Pictures]
+Method = Callable[[data_sets.ObjectData], Pictures]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,34 +85,24 @@ def _score(
     }
 
 
-def render_floor(method: str, cloud: PointCloud, camera: Camera, factor: float) -> tuple[Array, Array]:
-    """Image and opacity of a trivial renderer for all views of one cloud."""
-    if method == "white":
-        image = render_white(camera)
-        return image, jnp.zeros(image.shape[:-1])
-    return _draw_floor(cloud, camera, jnp.float32(factor * measure_nearest_distance(cloud)), method=method)
-
-
-@partial(jax.jit, static_argnames="method")
-def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
-    draw = {"splat": render_splat, "nearest": render_nearest}[method]
-    return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
-
-
 def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) -> float:
     """The radius factor with the highest PSNR over a few training objects."""
-    items = [data_sets.read_object(dataset, name) for name in dataset.splits["train"][:RADIUS_OBJECTS]]
+    names = dataset.splits["train"][:RADIUS_OBJECTS]
+    items = [_thin(data_sets.read_object(dataset, name), config) for name in names]
     if not items:
         raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
     def mean_psnr(factor: float) -> float:
-        values = []
-        for item in items:
-            image, _ = render_floor(method, data_sets.first_points(item, config.test_points), item.camera, factor)
-            values.append(metrics.psnr(image, jnp.asarray(data_sets.on_white(item.images))))
-        return float(np.mean(values))
+        show = make_floor(method, factor)
+        pairs = [(jnp.asarray(show(item).image), jnp.asarray(data_sets.on_white(item.images))) for item in items]
+        return float(np.mean([metrics.psnr(image, reference) for image, reference in pairs]))
 
     return max(RADIUS_FACTORS, key=mean_psnr)
+
+
+def _thin(item: data_sets.ObjectData, config: TrainConfig) -> data_sets.ObjectData:
+    """The object with the points that methods get."""
+    return dataclasses.replace(item, cloud=data_sets.first_points(item, config.test_points))
 
 
 def check_known_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None:
@@ -124,22 +114,32 @@ def check_known_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None
 def make_method(variables: dict, config: TrainConfig) -> Method:
     """The method of a trained network; normals are removed from the clouds, because other methods get none."""
 
-    def show(cloud: PointCloud, camera: Camera) -> Pictures:
-        cloud = dataclasses.replace(cloud, normals=None)
-        rendering = render_views(variables, config.model, cloud, camera)
+    def show(item: data_sets.ObjectData) -> Pictures:
+        cloud = dataclasses.replace(item.cloud, normals=None)
+        rendering = render_views(variables, config.model, cloud, item.camera)
         return Pictures(image=rendering.image, acc=rendering.acc, depth=rendering.depth)
 
     return show
 
 
 def make_floor(name: str, factor: float = 1.0) -> Method:
-    """The method of a trivial renderer."""
+    """The method of a trivial renderer; the radius of its points is `factor` times their spacing."""
 
-    def show(cloud: PointCloud, camera: Camera) -> Pictures:
-        image, acc = render_floor(name, cloud, camera, factor)
+    def show(item: data_sets.ObjectData) -> Pictures:
+        if name == "white":
+            image = render_white(item.camera)
+            return Pictures(image=image, acc=jnp.zeros(image.shape[:-1]))
+        radius = jnp.float32(factor * measure_nearest_distance(item.cloud))
+        image, acc = _draw_floor(item.cloud, item.camera, radius, method=name)
         return Pictures(image=image, acc=acc)
 
     return show
+
+
+@partial(jax.jit, static_argnames="method")
+def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
+    draw = {"splat": render_splat, "nearest": render_nearest}[method]
+    return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
 def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
@@ -150,19 +150,17 @@ def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_
         raise UserError(
             f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
         )
-    cloud = data_sets.first_points(item, config.test_points)
-    pictures, scores = {}, {}
+    item, pictures, scores = _thin(item, config), {}, {}
     for method, show in methods.items():
-        shown = show(cloud, item.camera)
-        scores[method] = score_pictures(item, shown)
-        pictures[method] = to_numpy(shown)
+        pictures[method] = to_numpy(show(item))
+        scores[method] = _score_pictures(item, pictures[method])
     return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
 
 
-def score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
+def _score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
     """All metrics of pictures of an object's views, LPIPS where it can be measured; the opacity is interpolated."""
     alpha, mask = item.images[..., 3] / np.float32(255), item.conditions[..., 3] > 0
-    image, reference = np.clip(np.asarray(pictures.image), 0, 1), data_sets.on_white(item.images)
+    image, reference = np.asarray(pictures.image), data_sets.on_white(item.images)
     acc = jax.image.resize(jnp.asarray(pictures.acc), alpha.shape, "bilinear")
     scores = jax.device_get(_score(image, acc, reference, alpha, mask)) | {"flip": flip(image, reference)}
     distance = lpips(image, reference)
@@ -331,12 +329,7 @@ def _shade_first(cloud, camera, order):
         index = jnp.argmin(ranks)
         return index, jnp.isfinite(ranks[index])
 
-    index, hit = _map_blocks(first, directions, cloud.mask.shape[0])
+    index, hit = jax.lax.map(first, directions, batch_size=max(1, BLOCK // cloud.mask.shape[0]))
     color = jnp.where(hit[:, None], linear_to_srgb(cloud.base_color)[index], 1.0)
     size = camera.height, camera.width
     return color.reshape(*size, 3), hit.astype(color.dtype).reshape(size)
-
-
-def _map_blocks(function, inputs, num_points):
-    """`function` of every row of `inputs`; as many rows at once as give BLOCK pairs of row and point."""
-    return jax.lax.map(function, inputs, batch_size=max(1, BLOCK // num_points))

@@ -9,9 +9,9 @@ Scores come by object, an array (views,) each; NaN is a view without a score and
 no number.  Views of one object are not independent, so objects are drawn, each with all its views, and the interval is
 that of the mean over views.  It is a percentile bootstrap; with few objects these are too narrow, so the levels are
 widened to those that are exact for the mean of normal scores (Hesterberg 2015, "expanded percentile"), and with fewer
-than FEWEST there is none.  Differences are taken view by view, so what makes an object hard for both methods cancels;
-their p-value is that of a sign-flip test over objects.  Objects are sorted before anything is drawn: their order does
-not matter.
+than FEWEST_OBJECTS there is none.  Differences are taken view by view, so what makes an object hard for both methods
+cancels; their p-value is that of a sign-flip test over objects.  Objects are sorted before anything is drawn: their
+order does not matter.
 """
 
 import importlib
@@ -72,7 +72,7 @@ def _views(pictures: AnyArray) -> Float[np.ndarray, "views height width 3"]:
 
 METRICS = ("psnr", "ssim", "cpsnr", "flip", "lpips", "iou")
 RESAMPLES, LEVEL, SEED = 10_000, 0.95, 0
-FEWEST = 5  # objects, below which no percentile of resampled means is as wide as an interval should be
+FEWEST_OBJECTS = 5  # objects, below which no percentile of resampled means is as wide as an interval should be
 
 Scores = dict[str, np.ndarray]  # metric -> score of each view (views,); cpsnr is NaN where no point is visible
 
@@ -91,7 +91,13 @@ def metric_settings() -> dict[str, str]:
 
 def summarise(results: Sequence[dict[str, Scores]]) -> dict[str, dict]:
     """Mean of each metric over all images of each method, its interval, and the counts behind them."""
-    return {method: _row([scores[method] for scores in results]) for method in results[0]}
+    table = {}
+    for method in results[0]:
+        objects = [scores[method] for scores in results]
+        visible = np.concatenate([scores["cpsnr"] for scores in objects])
+        counts = {"objects": len(objects), "views": len(visible), "cpsnr_views": int(np.sum(~np.isnan(visible)))}
+        table[method] = means(objects) | counts
+    return table
 
 
 def differences(results: Sequence[dict[str, Scores]], method: str = "ours") -> dict[str, dict]:
@@ -115,12 +121,6 @@ def means(objects: Sequence[Scores], metrics: Iterable[str] = METRICS) -> dict[s
     return row
 
 
-def _row(objects: list[Scores]) -> dict[str, Any]:
-    visible = np.concatenate([scores["cpsnr"] for scores in objects])
-    counts = {"objects": len(objects), "views": len(visible), "cpsnr_views": int(np.sum(~np.isnan(visible)))}
-    return means(objects) | counts
-
-
 def difference(first: Sequence[Scores], second: Sequence[Scores], metric: str) -> dict[str, Any] | None:
     """Scores of objects minus others of the same ones, view by view: mean, interval, p-value; None without a view."""
     from scipy.stats import permutation_test  # here, so that importing the package stays light
@@ -141,11 +141,11 @@ def difference(first: Sequence[Scores], second: Sequence[Scores], metric: str) -
 
 
 def interval(scores: Sequence[np.ndarray]) -> list[float] | None:
-    """Ends of the bootstrap interval of the mean over all views; None of fewer than FEWEST objects with a score."""
+    """Ends of the bootstrap interval of the mean over all views; None of fewer than FEWEST_OBJECTS with a score."""
     from scipy.stats import bootstrap
 
     sums, counts = _by_object(scores)
-    if len(sums) < FEWEST:
+    if len(sums) < FEWEST_OBJECTS:
         return None
     found = bootstrap(
         (sums, counts),

@@ -124,10 +124,9 @@ GALLERY_NOTE = (
     "range. Opacity: white is solid. Both are those of the first network."
 )
 QUALITY_NOTE = (
-    "Means over images, sRGB in [0, 1] over white. PSNR is capped at 100 dB. SSIM with a Gaussian window of sigma 1.5. "
-    "cPSNR is the PSNR over the pixels of visible input points; views without any are left out. FLIP: LDR, 67 pixels "
-    "per degree. LPIPS: AlexNet v0.1. Arrows show what is better, the best value of a column is bold. Small: 95 % "
-    "bootstrap interval over objects."
+    "Means over images; cPSNR is the PSNR over the pixels of visible input points. The settings below say how each "
+    "metric is measured. Arrows show what is better, the best value of a column is bold. Small: 95 % bootstrap "
+    "interval over objects."
 )
 DIFFERENCES_NOTE = (
     "The first network minus each other method, image by image, so what makes an object hard for both cancels. Small: "

@@ -1,4 +1,7 @@
-"""The options of the commands of `spnr`, as records; nothing that takes time to import, for `--help` reads them."""
+"""The options of the commands of `spnr`, as records; nothing that takes time to import, for `--help` reads them.
+
+An option that makes no sense raises ValueError, which names it.
+"""
 
 import dataclasses
 import math
@@ -22,7 +25,7 @@ def changed_options(options: Any) -> tuple[str, ...]:
     return tuple(f"--{name.replace('_', '-')}" for name in changed)
 
 
-def check_resolution(pixels: int | None) -> None:
+def require_drawable(pixels: int | None) -> None:
     """UserError for a number of pixels along a side that is not drawn."""
     if pixels is not None and not (16 <= pixels <= MOST_PIXELS and pixels % 4 == 0):
         raise UserError(f"--resolution must be a multiple of 4 from 16 to {MOST_PIXELS}, got {pixels}")
@@ -45,7 +48,6 @@ class Lighting:
     """Background: white, or the environment map, blurred."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         require(self.light != "", "--light: empty; expected a file or a name")
         require(math.isfinite(self.light_yaw), f"--light-yaw must be a number of degrees, got {self.light_yaw}")
         turned = self.light_yaw and self.sun and not self.light
@@ -72,15 +74,17 @@ class SplatOptions:
     """Pictures of the network that the splats are made from."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         require_within(self, FEWEST_SPLATS, MOST_SPLATS, "most_splats")
         require_within(self, 4, MOST_VIEWS, "fitting_views")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadOptions:
-    """How a file of points or a mesh is read."""
+class CloudOptions:
+    """A file of points or a mesh, how it is read, and what draws it in which light."""
 
+    cloud: tyro.conf.Positional[Path]
+    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
+    .stl .off (its surface is sampled)."""
     num_points: int = 16384
     """Points kept of a larger cloud, evenly spread, or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
@@ -88,29 +92,26 @@ class ReadOptions:
     clean: Literal["auto", "off", "strong"] = "auto"
     """Remove outliers and average noisy points before thinning; clean clouds and meshes are unchanged.  strong: at
     smaller deviations."""
+    run: Path | None = None
+    """Network that renders: a run folder or a weights file (default: `surfels`, which the package includes)."""
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
+    """Light; only `surfels` takes one other than its training light."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share(ReadOptions):
+class Share(CloudOptions):
     """Write one .html file that shows a cloud's object in any browser: Gaussian splats to turn, a poster, a title."""
 
-    cloud: tyro.conf.Positional[Path]
-    """What `spnr render` reads."""
     out: Path = Path("page.html")
     """The .html to write."""
     title: str | None = None
     """Title (default: the file's name)."""
     credit: str = ""
     """Credit and licence line."""
-    run: Path | None = None
-    """Network that renders it, as for `spnr render` (default: surfels)."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
-    """Light baked into the splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = SplatOptions()
     """How the splats are made."""
     azimuth: float = 30.0
     """Azimuth, in degrees, of the page's first view."""
@@ -118,7 +119,6 @@ class Share(ReadOptions):
     """Degrees above the horizon."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         super().__post_init__()
         if self.out.suffix.lower() not in (".html", ".htm") or self.out.is_dir():
             raise UserError(f"--out {self.out}: expected the name of an .html file")
@@ -132,16 +132,11 @@ Output = Literal["image", "depth", "opacity"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ReadOptions):
+class Render(CloudOptions):
     """Render a point cloud or mesh file: views as .png, a turntable, depth, opacity."""
 
-    cloud: tyro.conf.Positional[Path]
-    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
-    .stl .off (its surface is sampled)."""
     others: tyro.conf.Positional[tuple[Path, ...]] = ()
     """More clouds, rendered one after the other; those that cannot be are named and left out."""
-    run: Path | None = None
-    """Network that renders: a run folder or a weights file (default: `surfels`, which the package includes)."""
     out: Path = Path("renders")
     """Output folder."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()
@@ -170,8 +165,6 @@ class Render(ReadOptions):
     """Files to write for each view; depth comes coloured and as .npy."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """Light; only `surfels` takes one other than its training light."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
     """Format of the turntable."""
     turn: Literal["object", "light"] = "object"
@@ -187,7 +180,6 @@ class Render(ReadOptions):
         return (*changed_options(self.lighting), *(("--turn light",) if self.turn == "light" else ()))
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         super().__post_init__()
         names = [cloud.stem for cloud in (self.cloud, *self.others)]
         require(len(set(names)) == len(names), "two clouds have one name; give them an --out each")
@@ -198,7 +190,7 @@ class Render(ReadOptions):
         require(self.views > 0 or self.turntable != "none", "--views 0 --turntable none: nothing is left to draw")
         require_at_least(self, 1, "frames", "fps")
         require_within(self, -90, 90, "elevation")
-        check_resolution(self.resolution)
+        require_drawable(self.resolution)
         if self.turntable == "gif" and self.fps > FASTEST_GIF:
             raise UserError(f"--fps: a .gif shows at most {FASTEST_GIF} frames a second; take --turntable mp4")
         if self.transparent and self.lighting.background != "white":
@@ -249,9 +241,9 @@ class Export:
     """Write Gaussian splats: .ply or .spz."""
     network: Path | None = None
     """Network that renders the cloud for --splats, as `spnr render --run` (default: surfels)."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = field(default_factory=Lighting)
+    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
     """Light baked into --splats."""
-    making: tyro.conf.OmitArgPrefixes[SplatOptions] = field(default_factory=SplatOptions)
+    making: tyro.conf.OmitArgPrefixes[SplatOptions] = SplatOptions()
     """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The upward axis of the file for --splats, which are written with y up."""
@@ -271,9 +263,8 @@ class Export:
     """Target platforms."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         require_at_least(self, 1, "num_points")
-        check_resolution(self.resolution)
+        require_drawable(self.resolution)
         changed = changed_options(self)
         of_cloud = [name for name in changed if name in ("--network", "--up", "--clean")]
         of_cloud += [*changed_options(self.lighting), *changed_options(self.making)]
@@ -286,15 +277,9 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ReadOptions):
+class View(CloudOptions):
     """View the network's picture of a point cloud or mesh file in the browser: turn it, light it, save it."""
 
-    cloud: tyro.conf.Positional[Path]
-    """What `spnr render` reads."""
-    run: Path | None = None
-    """As for `spnr render`."""
-    lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
-    """Initial light; `surfels` takes any, other networks only that of their training."""
     host: str = "127.0.0.1"
     """Address to listen on; one other than this machine's own opens the viewer to a network."""
     port: int = 8080
@@ -305,7 +290,6 @@ class View(ReadOptions):
     """Object of a scene to show first; files that are dropped on the page are shown whole."""
 
     def __post_init__(self) -> None:
-        """ValueError names the option that makes no sense."""
         super().__post_init__()
         if self.reached_at is not None and not re.fullmatch(r"([\w.-]+|\[[\da-fA-F:.]+\])(:\d+)?", self.reached_at):
             raise ValueError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")

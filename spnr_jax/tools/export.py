@@ -54,7 +54,7 @@ from spnr_jax.surfels import geometry, lighting
 from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
-from spnr_jax.tools.commands import Export, Render, Share
+from spnr_jax.tools.commands import Export, Render, Share, require_drawable
 from spnr_jax.tools.pictures import PreparedObject, prepare_cloud
 from spnr_jax.training import weights
 
@@ -173,7 +173,6 @@ def export_network(options: Export) -> str:
         raise UserError(f"{options.run}: a file; expected a run folder, or {cloud}")
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
     model = Model(config=trained.config.model, variables=trained.variables)
-    _check_exportable(model)
     images.check_place(out / "weights.npz")
     points, size = options.num_points or 1024, options.resolution
     functions = {
@@ -220,7 +219,7 @@ def export_render(
     """
     _check_exportable(model)
     size = model.config.image_resolution if resolution is None else resolution
-    require(size >= 16 and size % 4 == 0, f"resolution must be a multiple of 4 of at least 16, got {size}")
+    require_drawable(size)
     if quality == "balanced":
         raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
     params = None if quality == "draft" else model.params

@@ -29,8 +29,8 @@ from spnr_jax.tools.pictures import light_of_options, put_background
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
 MOVING_LONGEST, LONGEST = 960, 1600  # pixels of the canvas's longer side, while it moves and at rest
 OBJECT_RADIUS = 1.2  # of a ball in the box that contains the drawn object; its points lie within 1
-FARTHEST = 1e3  # boxes; beyond, float32 rays miss (docs/lab/stability.md)
-MOST_PIXELS = 2**16  # along a side of a browser's canvas
+FARTHEST_EYE = 1e3  # boxes; beyond, float32 rays miss (docs/lab/stability.md)
+LARGEST_CANVAS = 2**16  # along a side of a browser's canvas
 NARROWEST, WIDEST = 1e-3, np.deg2rad(150)
 OPENCV = np.diag([1.0, -1.0, -1.0])  # the browser's cameras look along +z with y down, ours along -z with y up
 SUN_ALONE = "sun alone"  # the choice of no map, where there is a sun
@@ -141,8 +141,8 @@ def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: 
     )
     if turn is None or place is None or canvas is None:
         return None
-    near = np.linalg.norm(turn) > 1e-6 and (np.abs(place) < FARTHEST).all()
-    pixels = (canvas[1:] >= 2).all() and (canvas[1:] <= MOST_PIXELS).all()
+    near = np.linalg.norm(turn) > 1e-6 and (np.abs(place) < FARTHEST_EYE).all()
+    pixels = (canvas[1:] >= 2).all() and (canvas[1:] <= LARGEST_CANVAS).all()
     if not (near and pixels and NARROWEST <= canvas[0] <= WIDEST):
         return None
     rotation = Rotation.from_quat(turn, scalar_first=True).as_matrix() @ OPENCV

@@ -129,76 +129,66 @@ def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Cal
 
     Stills and film are rendered together: views with the same sizes share programs.
     """
-    stills = still_views(ready, options)
-    film = turntable_views(ready, options) if options.turntable != "none" else []
-    views, cameras = _draw(ready, [*stills, *film], options), [camera for camera, _ in stills]
-    for i, (camera, rendering) in enumerate(zip(cameras, views, strict=False)):  # the rest are the film's
-        yield partial(_write_still, f"{name}_{i:03d}", still_files(rendering, camera, ready.volume, options))
-    if cameras:
-        document = cameras_document(cameras, name.name, ready.placed, ready.volume)
+    stills = list(ready.cameras) or [_camera(ready, FIRST_AZIMUTH + turn, options) for turn in _turns(options.views)]
+    cameras, lights = list(stills), [ready.light] * len(stills)
+    if options.turntable != "none":
+        for turn in _turns(options.frames):
+            if options.turn == "light" and ready.light is not None:
+                cameras.append(_camera(ready, FIRST_AZIMUTH, options))
+                lights.append(ready.light.turned(turn))
+            else:
+                cameras.append(_camera(ready, turn, options))
+                lights.append(ready.light)
+    views = _draw(ready, cameras, lights, options)
+    for i, (camera, rendering) in enumerate(zip(stills, views, strict=False)):  # the rest are the film's
+        yield partial(_write_still, f"{name}_{i:03d}", rendering, camera, ready.volume, options)
+    if stills:
+        document = cameras_document(stills, name.name, ready.placed, ready.volume)
         images.write_whole(Path(f"{name}_cameras.json"), f"{json.dumps(document, indent=1)}\n".encode())
-    if film:
-        pictures = [np.asarray(rendering.image) for rendering in views]
-        yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), pictures, options)
+    if options.turntable != "none":
+        film = [np.asarray(rendering.image) for rendering in views]
+        yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), film, options)
 
 
-View = tuple[Camera, Light | None]
-
-
-def still_views(ready: PreparedObject, options: Render) -> list[View]:
-    """The cameras of the file, or some evenly around the object, and its light."""
-    if ready.cameras:
-        return [(camera, ready.light) for camera in ready.cameras]
-    turns = np.arange(options.views) * 360 / max(options.views, 1)
-    return [(_camera(ready, FIRST_AZIMUTH + turn, options), ready.light) for turn in turns]
-
-
-def turntable_views(ready: PreparedObject, options: Render) -> list[View]:
-    """Camera and light of each image of one turn around the object, or of its light."""
-    turns, light = np.arange(options.frames) * 360.0 / options.frames, ready.light
-    if options.turn == "object" or light is None:
-        return [(_camera(ready, turn, options), light) for turn in turns]
-    return [(_camera(ready, FIRST_AZIMUTH, options), light.turned(turn)) for turn in turns]
+def _turns(count: int) -> list[float]:
+    """Even angles in degrees, from 0."""
+    return [360 * i / count for i in range(count)]
 
 
 def _camera(ready: PreparedObject, azimuth: float, options: Render) -> Camera:
-    return ready.model.camera(ready.volume, float(azimuth), options.elevation, options.resolution)
+    return ready.model.camera(ready.volume, azimuth, options.elevation, options.resolution)
 
 
-def _draw(ready: PreparedObject, views: list[View], options: Render) -> Iterator[Rendering]:
+def _draw(
+    ready: PreparedObject, cameras: list[Camera], lights: list[Light | None], options: Render
+) -> Iterator[Rendering]:
     """Renderings of the views, one after the other, in front of their background."""
-    cameras, lights = [camera for camera, _ in views], [light for _, light in views]
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
-    for (camera, light), rendering in zip(views, renderings, strict=True):
+    for camera, light, rendering in zip(cameras, lights, renderings, strict=True):
         yield put_background(options.lighting.background, rendering, camera, light)
 
 
-def _write_still(stem: str, files: Iterator[tuple[str, bytes]]) -> str:
-    written = []
-    for suffix, data in files:
-        images.write_whole(path := Path(stem + suffix), data)
-        written.append(path)
-    return f"wrote {written[0]}"
+def _write_still(stem: str, rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> str:
+    """Writes the files of one view; a line that names the first."""
+    acc, files = np.asarray(rendering.acc), {}
+    if "image" in options.outputs:
+        image = np.asarray(rendering.image)
+        files[".png"] = images.png(straight_alpha(image, acc) if options.transparent else image)
+    if "depth" in options.outputs:
+        files["_depth.png"] = images.png(images.depth_image(rendering.depth, acc))
+        stream = io.BytesIO()
+        np.save(stream, surface_depth(rendering, camera, volume))
+        files["_depth.npy"] = stream.getvalue()
+    if "opacity" in options.outputs:
+        files["_opacity.png"] = images.png(np.repeat(acc[..., None], 3, axis=-1))
+    for suffix, content in files.items():
+        images.write_whole(Path(stem + suffix), content)
+    return f"wrote {stem}{next(iter(files))}"
 
 
 def _write_film(path: Path, film: list[np.ndarray], options: Render) -> str:
     path, reason = images.write_turntable(path, film, options.fps)
     return f"wrote {path}" + (f" ({reason})" if reason else "")
-
-
-def still_files(rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> Iterator[tuple[str, bytes]]:
-    """(suffix of the name, content) of the files of one view."""
-    acc = np.asarray(rendering.acc)
-    if "image" in options.outputs:
-        image = np.asarray(rendering.image)
-        yield ".png", images.png(straight_alpha(image, acc) if options.transparent else image)
-    if "depth" in options.outputs:
-        yield "_depth.png", images.png(images.depth_image(rendering.depth, acc))
-        stream = io.BytesIO()
-        np.save(stream, surface_depth(rendering, camera, volume))
-        yield "_depth.npy", stream.getvalue()
-    if "opacity" in options.outputs:
-        yield "_opacity.png", images.png(np.repeat(acc[..., None], 3, axis=-1))
 
 
 def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.methods import method_of
 from spnr_jax.tools import frame
-from spnr_jax.tools.commands import Lighting, View, changed_options
+from spnr_jax.tools.commands import View, changed_options
 from spnr_jax.tools.frame import State
 from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
@@ -48,11 +48,6 @@ _guarding = threading.Lock()
 Shown = TypeVar("Shown")
 
 RequestHook = Callable[[Any, Request], Any]
-
-
-def new_token() -> str:
-    """A random token of URL-safe characters."""
-    return secrets.token_urlsafe(LENGTH)
 
 
 def check_request(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
@@ -213,9 +208,6 @@ class Browser:
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))
 
-    def _relight(self, lighting: Lighting) -> None:
-        self.loop.submit(lambda state: frame.relight(state, lighting))
-
     def _try(self, work: Callable[[], None]) -> None:
         """Draw, or run the callback of a control; errors of the user and a want of memory become a notification."""
         try:
@@ -245,10 +237,13 @@ class Browser:
             "exposure": gui.add_slider("Exposure", -widest, widest, 0.25, options.exposure),
         }
 
+        def relight() -> None:
+            lighting = frame.read_lighting(self.loop.state, **{name: x.value for name, x in self._light.items()})
+            self.loop.submit(lambda state: frame.relight(state, lighting))
+
         async def move(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not when the program itself chooses a new map
-                message = {name: control.value for name, control in self._light.items()}
-                self._try(lambda: self._relight(frame.read_lighting(self.loop.state, **message)))
+                self._try(relight)
 
         for control in self._light.values():
             control.on_update(move)
@@ -321,7 +316,7 @@ class Viewer:
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}
-        token = new_token()
+        token = secrets.token_urlsafe(LENGTH)
         with (
             require_token(token, reached_at) as opened,
             contextlib.redirect_stdout(io.StringIO()),

@@ -94,9 +94,7 @@ def prepare(
     return lambda first_step: batches(dataset, config, first_step)
 
 
-def batches(
-    dataset: Dataset, config: TrainConfig, first_step: int, cache_bytes: int = CACHE_BYTES
-) -> Generator[Batch, None, None]:
+def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator[Batch, None, None]:
     """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
     names = dataset.splits["train"]
     if not names:
@@ -106,7 +104,7 @@ def batches(
             f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
             "--spread even, or use even_share 0"
         )
-    read = cached_reader(dataset, config, cache_bytes)
+    read = cached_reader(dataset, config)
 
     def assemble(step: int) -> Batch:
         return make_batch([read(name) for name in object_names(names, config, step)], config, step)
@@ -120,13 +118,13 @@ def read_ahead(assemble: Callable[[int], Any], first_step: int, config: TrainCon
     yield from run_ahead((functools.partial(assemble, step) for step in steps), READERS, READ_AHEAD)
 
 
-def cached_reader(dataset: Dataset, config: TrainConfig, cache_bytes: int) -> Callable[[str], ObjectData]:
-    """A function of an object's name that reads it, checked against the config; the first `cache_bytes` stay in memory.
+def cached_reader(dataset: Dataset, config: TrainConfig) -> Callable[[str], ObjectData]:
+    """A function of an object's name that reads it, checked against the config; the first CACHE_BYTES stay in memory.
 
     Several threads may call it.  Which objects stay does not matter: an epoch needs each of them once.
     """
     cache: dict[str, ObjectData] = {}
-    lock, free = threading.Lock(), cache_bytes
+    lock, free = threading.Lock(), CACHE_BYTES
 
     def read(name: str) -> ObjectData:
         nonlocal free

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import jax
+from flax.traverse_util import flatten_dict
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
@@ -52,8 +53,9 @@ def write_config(run: Path, config: TrainConfig) -> None:
     """Makes the run folder hold this config; ValueError if it holds the run of another one."""
     path = run / "config.json"
     if path.exists() and (run / "checkpoints").is_dir():  # without a checkpoint there is nothing to protect
-        stored = to_dict(read_config(run))
-        changed = _differences(stored, json.loads(json.dumps(to_dict(config))))
+        stored, wanted = (flatten_dict(to_dict(x), sep=".") for x in (read_config(run), config))
+        both = [name for name in wanted if name in stored]  # fields of another method are not compared
+        changed = [f"{x} {stored[x]} there, {wanted[x]} asked" for x in both if stored[x] != wanted[x]]
         if changed:
             raise UserError(
                 f"{run} holds a run with another config ({'; '.join(changed[:4])}); choose a new run folder"
@@ -69,17 +71,6 @@ def record_data(run: Path, dataset: Dataset) -> bool:
     if known != checksum:
         write_whole(path, checksum.encode())
     return known in (None, checksum) or not (run / "checkpoints").is_dir()
-
-
-def _differences(stored: dict, wanted: dict, path: str = "") -> list[str]:
-    changed = []
-    for name in (name for name in wanted if name in stored):  # fields of another method are not compared
-        old, value = stored[name], wanted[name]
-        if isinstance(value, dict):
-            changed += _differences(old, value, f"{path}{name}.")
-        elif json.loads(json.dumps(old)) != value:
-            changed.append(f"{path}{name} {old} there, {value} asked")
-    return changed
 
 
 def read_config(run: Path | str) -> TrainConfig:

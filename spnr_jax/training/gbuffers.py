@@ -56,7 +56,7 @@ OWN_NORMALS = 0.5  # share of these whose normals are estimated from the kept po
 SIDES = (1, 1, 1, 1, 2, 4, 8)  # a view averages side x side pixels of its reference; drawn from these
 SMALL, FEWER = 4, 8  # from this side on, a cloud has at most 1 / FEWER of the points
 LEAST_PADDED = 2048  # of a padded cloud, half that of its surfels: with few sizes, little is compiled
-MOST_ENTRIES = 2**22  # of a view: one with more is dropped
+MOST_VIEW_ENTRIES = 2**22  # of a view: one with more is dropped
 LEAST_PIXELS = 8  # least pixels along the shorter side of a view
 MARGIN, FAINT = 6, 0.01  # pixels around the object; opacity above which a pixel belongs to it
 SIZES = (96, 72, 48, 48, 32)  # pixels along a crop, by doublings; scaled if config.crop is not the first
@@ -73,7 +73,7 @@ Arrays = dict[str, np.ndarray]
 NAMES = ("seen", "maps", "ambient", "target")
 
 
-class View(NamedTuple):
+class KeptView(NamedTuple):
     """The file and index of a stored view, and how often its resolution is doubled."""
 
     path: Path
@@ -126,7 +126,7 @@ def loss(
     )
 
 
-def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[View]:
+def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[KeptView]:
     """The views of the data set; missing, broken and other files are made first; `variables` hold the densifier."""
     views, source = [], digest(dataset, light, config, variables)
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
@@ -139,7 +139,7 @@ def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Pa
                 arrays = make_views(item, number, light, config, variables) | {"source": source}
                 write_whole(path, pack_arrays(arrays))  # not compressed: a view is read for each crop
                 found[number] = arrays["doublings"].tolist()
-        views += [View(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
+        views += [KeptView(path, i, d) for path, of in zip(paths, found, strict=True) for i, d in enumerate(of or ())]
     if not views:
         raise UserError(f"{dataset.folder}: no object of its train split can be learnt from; generate more objects")
     return views
@@ -229,7 +229,7 @@ def make_view(
         return None
     drawn = cameras.resize(camera, *(n // (side * scale) for n in image.shape[:2]))
     needed = jax.device_get(surfel_renderer.count_sizes(scene, drawn, doublings=0, side=1))
-    if not 0 < needed.entries <= MOST_ENTRIES:
+    if not 0 < needed.entries <= MOST_VIEW_ENTRIES:
         return None
     whole = drawn.height * drawn.width
     capacity, slots = _round_size(int(needed.entries), 2**16), min(_round_size(int(needed.slots), whole // 16), whole)
@@ -277,16 +277,16 @@ def _find_bounds(inside: np.ndarray) -> slice:
     return slice(max(first - MARGIN, 0), min(last + 1 + MARGIN, len(inside)))
 
 
-def batches(views: list[View], config: TrainConfig, first_step: int) -> Generator[Crops, None, None]:
+def batches(views: list[KeptView], config: TrainConfig, first_step: int) -> Generator[Crops, None, None]:
     """Training batches from `first_step` on, prepared ahead."""
-    by_doublings: dict[int, list[View]] = {}
+    by_doublings: dict[int, list[KeptView]] = {}
     for view in views:
         by_doublings.setdefault(view.doublings, []).append(view)
     assemble: Callable[[int], Crops] = partial(make_batch, by_doublings, config)
     yield from read_ahead(assemble, first_step, config)
 
 
-def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> Crops:
+def make_batch(views: dict[int, list[KeptView]], config: TrainConfig, step: int) -> Crops:
     """The batch of a step: crops of random views with equal doublings, randomly mirrored."""
     generator = np.random.default_rng((config.seed, CROP_STREAM, step))
     shares = np.array([SHARES[doublings] for doublings in sorted(views)])
@@ -303,7 +303,7 @@ def make_batch(views: dict[int, list[View]], config: TrainConfig, step: int) -> 
     return Crops(inputs=stacked.pop("seen"), **stacked, doublings=doublings, margin=margin)
 
 
-def read_view(view: View) -> Arrays:
+def read_view(view: KeptView) -> Arrays:
     """The arrays of a view; ValueError if its file cannot be read."""
     try:
         with view.path.open("rb") as file:

@@ -123,8 +123,6 @@ def read_weights(path: Path) -> Trained:
         with path.open("rb") as file:
             arrays = read_arrays(file)
         described, steps = json.loads(arrays.pop("config").tobytes()), int(arrays.pop("steps"))
-        if not isinstance(described, dict):
-            raise UserError("its config is no JSON object")
         config = from_dict(described)
         if path != packaged_file():
             _check_weights(arrays, variable_shapes(config))

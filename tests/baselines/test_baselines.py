@@ -104,7 +104,7 @@ def test_an_object_without_points_has_a_finite_code():
         (lambda: NPBGConfig(encoder_widths=(16,)), "encoder_widths.*one entry more"),
         (lambda: NPBGConfig(encoder_widths=(16, 6, 48, 64, 80)), "encoder_widths.*6 channels of a raster"),
         (lambda: NPBGConfig(image_resolution=31), "image_resolution.*at least 32"),
-        (lambda: PointNeRFConfig(radius=0.0), "radius.*positive"),
+        (lambda: PointNeRFConfig(radius=0.0), "radius.*above 0"),
         (lambda: PointNeRFConfig(num_samples=401), "num_samples.*num_candidates 400"),
         (lambda: PointNeRFConfig(jitter=1.5), "jitter.*a share"),
         (lambda: dataclasses.replace(npbg.npbg_tiny(), loss=LossConfig()), r"adversarial_weight 1\.0.*use 0"),

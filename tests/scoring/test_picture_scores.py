@@ -152,7 +152,7 @@ class TestIntervals:
         pools = [np.array([1.0]), np.array([2.0, 4.0]), np.array([9.0])]
         means = [np.concatenate(drawn).mean() for drawn in itertools.product(pools, repeat=3)]
         assert interval(found) is None, "the whole range of the resamples would be too narrow"
-        monkeypatch.setattr(picture_scores, "FEWEST", 3)
+        monkeypatch.setattr(picture_scores, "FEWEST_OBJECTS", 3)
         monkeypatch.setattr(picture_scores, "confidence_level", lambda count: 0.6)
         exact = [float(np.quantile(means, level, method="inverted_cdf")) for level in (0.2, 0.8)]
         assert interval(found) == pytest.approx(exact)

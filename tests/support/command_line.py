@@ -13,7 +13,9 @@ def spnr_data(*arguments: object) -> int:
 
 
 def exit_code(program: ModuleType, *arguments: object) -> int:
-    """The exit code of a program's main in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        program.main([str(argument) for argument in arguments])
+    """The exit code of a program's main in this process, which writes nothing to the home folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(program, "set_up_jax", lambda **_: None, raising=False)
+        with pytest.raises(SystemExit) as stopped:
+            program.main([str(argument) for argument in arguments])
     return stopped.value.code

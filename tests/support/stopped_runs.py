@@ -26,8 +26,8 @@ def interrupted(monkeypatch, module, step, number=signal.SIGTERM):
     """Makes the signal arrive while the batch after `step` steps is fetched; `module` holds the method's `batches`."""
     real = module.batches
 
-    def batches(source, config, first, **options):
-        for i, batch in enumerate(real(source, config, first, **options), start=first):
+    def batches(source, config, first):
+        for i, batch in enumerate(real(source, config, first), start=first):
             if i + 1 == step:
                 signal.raise_signal(number)
             yield batch

@@ -46,7 +46,7 @@ def dataset() -> data_sets.Dataset:
 
 
 @functools.cache
-def views() -> list[gbuffers.View]:
+def views() -> list[gbuffers.KeptView]:
     """The views of the ball's clouds, in a folder that a test copies to change it."""
     return gbuffers.make_missing(dataset(), LIGHT, CONFIG, tiny_dataset.folder() / "gbuffers", {})
 

@@ -28,8 +28,7 @@ def cloud(tmp_path):
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch):
-    """Quick ones, and nothing is written to the home folder."""
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
+    """Quick ones."""
     monkeypatch.setattr(surfaces, "RESOLUTION", tiny_surfels.SIZE)
     monkeypatch.setattr(surfel_method, "densify_sparse", lambda variables, cloud, *_: cloud)  # it takes long to trace
 

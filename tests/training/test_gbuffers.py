@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import surfel_clouds, tiny_dataset, tiny_surfels
+from support import surfel_clouds, tiny_surfels
 from support.laws import close, same_bits
 from support.stopped_runs import PICTURE, interrupted, rows_without_time
 from support.tiny_surfels import CONFIG, LIGHT, NAME, SCHEDULE
@@ -25,7 +25,7 @@ from spnr_jax.nn import shader
 from spnr_jax.scoring import evaluation
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.sides import DIRECTIONS, spiral
-from spnr_jax.training import batching, checkpoint, gbuffers, optimisation, trainer, weights
+from spnr_jax.training import checkpoint, gbuffers, optimisation, trainer, weights
 
 AXES = pytest.mark.parametrize("axis", [0, 1])
 
@@ -34,10 +34,6 @@ AXES = pytest.mark.parametrize("axis", [0, 1])
 def loss(params, crops, config=CONFIG):
     value, outcome = gbuffers.loss({"params": params}, crops, config=config)
     return value, outcome.metrics
-
-
-def grouped(views):
-    return {d: [view for view in views if view.doublings == d] for d in {view.doublings for view in views}}
 
 
 def made(seed, number):
@@ -86,7 +82,7 @@ def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_b
     assert {path for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]} == {broken}
     broken.write_bytes(whole[:-30])
     with pytest.raises(ValueError, match=r"npz: is a broken.*remove it"):
-        gbuffers.read_view(gbuffers.View(broken, 0, 0))
+        gbuffers.read_view(gbuffers.KeptView(broken, 0, 0))
 
 
 def test_files_made_of_something_else_are_made_again(monkeypatch, tmp_path):
@@ -129,7 +125,7 @@ def test_batches_are_a_function_of_seed_and_step():
     for a, b in zip(gbuffers.batches(views, CONFIG, 2), whole[2:], strict=True):
         assert a.doublings == b.doublings
         same_bits(a, b)
-    other = gbuffers.make_batch(grouped(views), dataclasses.replace(CONFIG, seed=1), 0)
+    other = next(gbuffers.batches(views, dataclasses.replace(CONFIG, seed=1), 0))
     assert other.doublings != whole[0].doublings or not np.array_equal(other.inputs, whole[0].inputs)
 
 
@@ -306,10 +302,3 @@ def test_the_room_is_the_light_where_a_data_set_names_no_other_one():
         with pytest.raises(ValueError, match=r"lit by forest\.hdr"):
             learn_or_score()
     gbuffers.prepare(CONFIG, other, Path("run"), light=LIGHT)
-
-
-def test_ray_marching_networks_refuse_views_with_lights_of_their_own_in_one_line(tmp_path):
-    dataset = dataclasses.replace(tiny_dataset.dataset(), settings={"environment_map": {"kinds": [{"name": "random"}]}})
-    with pytest.raises(ValueError, match="preset tiny learns one light alone; train --preset surfels") as refused:
-        batching.prepare(tiny_dataset.CONFIG, dataset, tmp_path, light=None)
-    assert "\n" not in str(refused.value)

@@ -271,9 +271,8 @@ class TestLearningRate:
     def test_or_by_an_exponential(self):
         """Point-NeRF's: a tenth after half of the steps."""
         o = OptimizerConfig(lr_generator=5e-4, warmup_steps=0, final_lr_scale=0.01, decay="exponential")
-        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=1_000_000))
-        for at, expected in ((0, 5e-4), (500_000, 5e-5), (1_000_000, 5e-6)):
-            assert float(rate(at)) == pytest.approx(expected, rel=1e-4)
+        rate = optimisation.learning_rate(dataclasses.replace(CONFIG, optimizer=o, num_steps=100))
+        np.testing.assert_allclose([rate(at) for at in (0, 50, 100)], [5e-4, 5e-5, 5e-6], rtol=1e-4)
 
 
 @pytest.mark.parametrize("stride", [4, 3])
