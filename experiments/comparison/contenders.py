@@ -23,7 +23,7 @@ LABELS = {  # method -> its name in tables and pictures, in their order
     **{name: label(name) for name in ("ours", *METHODS)},
     "poisson": "Poisson",
     "poisson_trimmed": "Poisson, trimmed 0.3",
-    **{name: label(name) for name in reversed(evaluation.FLOORS)},
+    **{name: label(name) for name in reversed(evaluation.TRIVIAL)},
 }
 
 
@@ -81,9 +81,9 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
     return found
 
 
-def of_floor(name: str, factor: float) -> Method:
+def of_trivial(name: str, factor: float) -> Method:
     """A trivial renderer with the radius of its points, in point spacings."""
-    show = evaluation.make_floor(name, factor)
+    show = evaluation.make_trivial(name, factor)
     return Method(
         draw=lambda _, item: show(item),
         compiles=True,
@@ -92,11 +92,11 @@ def of_floor(name: str, factor: float) -> Method:
     )
 
 
-def floors(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dict[str, Method]:
+def trivial_ones(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dict[str, Method]:
     """The trivial renderers among these names, with the radius that is best on training objects."""
-    wanted = [name for name in reversed(evaluation.FLOORS) if name in names]
+    wanted = [name for name in reversed(evaluation.TRIVIAL) if name in names]
     return {
-        name: of_floor(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
+        name: of_trivial(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
         for name in wanted
     }
 

@@ -192,7 +192,7 @@ def score_objects(
         item = data_sets.read_object(dataset, name)
         result = evaluation.evaluate_object(shows, config, item)
         for label, pictures in result.pictures.items():
-            if not methods[label].has_opacity and label not in evaluation.FLOORS:
+            if not methods[label].has_opacity and label not in evaluation.TRIVIAL:
                 del result.scores[label]["iou"]  # it predicts colours alone
             if more:
                 result.scores[label] |= more(item, pictures)

@@ -100,15 +100,15 @@ def main(options: Table1) -> None:
     trained = variants.train(
         [Variant(name=name, label=LABELS[name], config=configs[name], dataset=dataset) for name in wanted], options.out
     )
-    floors = contenders.floors(options.methods, dataset, config)
-    compared = {name: contenders.of_network(t.config, t.variables) for name, t in trained.items()} | surfaces | floors
+    trivial = contenders.trivial_ones(options.methods, dataset, config)
+    compared = {name: contenders.of_network(t.config, t.variables) for name, t in trained.items()} | surfaces | trivial
     if not compared:
         raise UserError(f"--methods {' '.join(options.methods)}: none can be made here, {' '.join(missing.values())}")
     scored = score_objects(compared, config, dataset, names, options.shown)
     found = {
         **asked,
         **variants.conditions(dataset, names, config),
-        "radius_factors": {name: of.radius for name, of in floors.items() if of.radius is not None},
+        "radius_factors": {name: of.radius for name, of in trivial.items() if of.radius is not None},
         "missing": missing,
         **variants.compare(scored, next((name for name in NETWORKS if name in trained), None)),
         "costs": costs(trained, scored),

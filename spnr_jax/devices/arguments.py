@@ -12,7 +12,9 @@ import tyro
 
 from spnr_jax.errors import UserError
 
-# what tyro draws around an error, its marks of bold letters, and its name for the whole command
+# Parts of tyro's error box, which becomes one line: "╭─ Parsing error ─╮ │ ... invalid literal for int() with base 10:
+# 'x' ... │ Argument helptext: ... │" -> "... expected INT, got 'x'."  BOX: frame, marks of bold letters, and tyro's name
+# for the whole command
 BOX = r"[╭╮╰╯│─•]+|-{4,}|\[/?bold\]|__tyro-dummy-inner__\."
 UNION = r"no type matching (?:\{None\}\|)?(.+?) could be instantiated from \[(.+?)\]\..*?(?= Argument helptext)"
 NUMBER = r"(?:invalid literal for (int)\(\) with base 10|could not convert string to (float)): ('.*?')"

@@ -151,7 +151,7 @@ def render_rays(
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
     if module.is_initializing():
         return _on_one_device(lambda: module, scene, rays, number, samples, options, key)
-    network, variables = module.unbind()  # transformations of JAX must not close over a bound module
+    network, variables = module.unbind()  # JAX transformations must not close over a bound module
 
     def render_own(whole, scene, own_rays):
         variables, key = whole
@@ -161,7 +161,7 @@ def render_rays(
 
 
 def _on_one_device(
-    bound: Callable[[], Any],
+    make_network: Callable[[], Any],
     scene: Scene,
     rays: Rays,
     number: Int[Array, "objects rays"],
@@ -169,14 +169,14 @@ def _on_one_device(
     options: RenderOptions,
     key: Key | None,
 ) -> RenderedRays:
-    """`render_rays` of the rays that lie on one device."""
+    """`render_rays` for the rays of one device; `make_network` binds the Linen module anew inside transformations."""
     shape = number.shape
     objects = jnp.broadcast_to(jnp.arange(shape[0])[:, None], shape)
     inputs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (objects, number, rays))
     near_points = voxels.dilate(scene.occupied, samples.reach) if samples.reach else None
 
     def block(objects, number, rays):
-        field, decode = bound().make_field(scene, rays, objects)
+        field, decode = make_network().make_field(scene, rays, objects)
         keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
         composited = march(field, _path(near_points, rays, objects), samples, keys)
         return RenderedRays(decode(composited), composited.depth, composited.acc)
@@ -184,14 +184,14 @@ def _on_one_device(
     size = options.block
     if size is None and samples.reach:
         size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
-    if size is None or bound().is_initializing():  # at initialisation there are no weights yet that a block could read
+    if size is None or make_network().is_initializing():  # then there are no weights yet that a block could read
         rendered = block(*inputs)
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
-        white = jnp.zeros((far.size, bound().config.num_features)).at[:, :3].set(WHITE)
-        nothing = RenderedRays(white, far, jnp.zeros_like(far))
-        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, nothing, size)
+        white = jnp.zeros((far.size, make_network().config.num_features)).at[:, :3].set(WHITE)
+        missed = RenderedRays(white, far, jnp.zeros_like(far))
+        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, missed, size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rendered)
 
 

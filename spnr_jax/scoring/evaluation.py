@@ -39,7 +39,7 @@ from spnr_jax.training.weights import Trained, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
 RADIUS_OBJECTS = 8  # training objects on which one of them is chosen
-FLOORS = ("white", "splat", "nearest")
+TRIVIAL = ("white", "splat", "nearest")  # the trivial renderers above
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB
 
 
@@ -93,7 +93,7 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) 
         raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
     def mean_psnr(factor: float) -> float:
-        show = make_floor(method, factor)
+        show = make_trivial(method, factor)
         pairs = [(jnp.asarray(show(item).image), jnp.asarray(data_sets.on_white(item.images))) for item in items]
         return float(np.mean([metrics.psnr(image, reference) for image, reference in pairs]))
 
@@ -122,7 +122,7 @@ def make_method(variables: dict, config: TrainConfig) -> Method:
     return show
 
 
-def make_floor(name: str, factor: float = 1.0) -> Method:
+def make_trivial(name: str, factor: float = 1.0) -> Method:
     """The method of a trivial renderer; the radius of its points is `factor` times their spacing."""
 
     def show(item: data_sets.ObjectData) -> Pictures:
@@ -130,14 +130,14 @@ def make_floor(name: str, factor: float = 1.0) -> Method:
             image = render_white(item.camera)
             return Pictures(image=image, acc=jnp.zeros(image.shape[:-1]))
         radius = jnp.float32(factor * measure_nearest_distance(item.cloud))
-        image, acc = _draw_floor(item.cloud, item.camera, radius, method=name)
+        image, acc = _draw_trivial(item.cloud, item.camera, radius, method=name)
         return Pictures(image=image, acc=acc)
 
     return show
 
 
 @partial(jax.jit, static_argnames="method")
-def _draw_floor(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
+def _draw_trivial(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *, method: str) -> tuple[Array, Array]:
     draw = {"splat": render_splat, "nearest": render_nearest}[method]
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
@@ -247,7 +247,7 @@ def compare(
         check_known_light(one.config.model, dataset)
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
-    methods |= {name: make_floor(name, factors.get(name, 1.0)) for name in FLOORS}
+    methods |= {name: make_trivial(name, factors.get(name, 1.0)) for name in TRIVIAL}
     scores, gallery = score_methods(methods, config, dataset, names, gallery_objects, say)
     summary = {
         "methods": summarise(list(scores.values())),

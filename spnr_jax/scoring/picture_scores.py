@@ -5,13 +5,11 @@ dynamic range) compares what the eye resolves at PIXELS_PER_DEGREE, by the packa
 al. 2018, version 0.1, AlexNet) compares features of a trained network; it is measured where the package `lpips` is
 installed and finds its weights.  Both are 0 for the same picture.
 
-Scores come by object, an array (views,) each; NaN is a view without a score and is left out, None stands where there is
-no number.  Views of one object are not independent, so objects are drawn, each with all its views, and the interval is
-that of the mean over views.  It is a percentile bootstrap; with few objects these are too narrow, so the levels are
-widened to those that are exact for the mean of normal scores (Hesterberg 2015, "expanded percentile"), and with fewer
-than FEWEST_OBJECTS there is none.  Differences are taken view by view, so what makes an object hard for both methods
-cancels; their p-value is that of a sign-flip test over objects.  Objects are sorted before anything is drawn: their
-order does not matter.
+Scores are an array (views,) for each object; a NaN is a view without a score and is left out; None: no number.
+Intervals are those of the mean over views, by a cluster bootstrap over objects (views of one object are not
+independent): percentile intervals at an expanded level that is exact for means of normal scores (Hesterberg 2015), none
+below FEWEST_OBJECTS.  Differences are paired by view; their p-value is that of a sign-flip test over objects.  Objects
+are sorted first, so their order does not matter.
 """
 
 import importlib

@@ -1,7 +1,7 @@
 """An evaluation as files: metrics.json for programs, report.html for people.
 
 The report is one file that holds everything, to open from disk, to mail, to keep: key numbers and summary, which
-objects are scored, their pictures, quality beside the floors, settings.  Images are PNGs inside the page (report.html
+objects are scored, their pictures, quality beside the trivial, settings.  Images are PNGs inside the page (report.html
 is its template); nothing is loaded from elsewhere, and no script runs.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from spnr_jax.formats.images import depth_image, png_url, template, write_whole
 from spnr_jax.methods import label_of, to_dict
-from spnr_jax.scoring.evaluation import FLOORS, Evaluation, ObjectResult, Pictures, median_view
+from spnr_jax.scoring.evaluation import TRIVIAL, Evaluation, ObjectResult, Pictures, median_view
 from spnr_jax.scoring.picture_scores import NO_LPIPS
 
 OTHERS = {  # methods that are not trained -> name in tables and pictures
@@ -175,7 +175,7 @@ def _summary(metrics: Mapping) -> str:
     """Summary of the first network, and its lead in dB over the trivial renderers."""
     methods, settings = metrics["methods"], metrics["settings"]
     network, row = next(iter(methods.items()))
-    best = max((name for name in FLOORS if name in methods), key=lambda name: methods[name]["psnr"])
+    best = max((name for name in TRIVIAL if name in methods), key=lambda name: methods[name]["psnr"])
     above = [(other, metrics[f"{network}_minus"][other]["psnr"]) for other in dict.fromkeys(("white", best))]
     texts = [
         " ".join([f"{found['mean']:+.2f} dB", *number(found["mean"], 2, found["interval"], sign="+").small])

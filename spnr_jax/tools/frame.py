@@ -115,7 +115,7 @@ def relight(state: State, lighting: Lighting) -> State:
 
 
 def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
-    """The canvas, uint8; None before the browser said its view.
+    """The canvas, uint8; None until the browser has sent its camera.
 
     Moving: `draft`, at the network's own size.  At rest: the chosen quality.
     """

@@ -182,7 +182,11 @@ def make_views(item: ObjectData, number: int, light: Light, config: TrainConfig,
 
 
 def random_cloud(cloud: PointCloud, side: int, config: TrainConfig, generator: np.random.Generator) -> PointCloud:
-    """A random or farthest-point sample of a cloud, with or without normals, or of a simulated scan of it."""
+    """A training cloud: a random or farthest-point sample of the object's points, or of a simulated scan of them.
+
+    Of the clouds that are no scans, half have given normals, a quarter normals estimated from all points, and a quarter
+    none: those are estimated later, from the kept points alone.
+    """
     most = max(config.max_points // (FEWER if side >= SMALL else 1), config.min_points)
     count = min(int(np.exp(generator.uniform(np.log(config.min_points), np.log(most)))), len(cloud.mask))
     even = generator.random() < config.even_share and count <= MOST_EVEN
@@ -223,7 +227,7 @@ def make_view(
     """Doublings and arrays of a view with `side` times fewer pixels along a side; None if it shows too little."""
     small = cameras.resize(camera, camera.height // side, camera.width // side)
     doublings, finer = surfel_renderer.choose_resolution(scene, small)
-    # drawn at twice the size, it is compared at that size, or at the reference's if that has no more pixels
+    # supersampled by `finer`: compared at that resolution, but never above the reference's
     side, scale = max(side // finer, 1), 2**doublings
     if any(n % (side * scale) or n // (side * scale) < LEAST_PIXELS for n in image.shape[:2]):
         return None

@@ -204,7 +204,7 @@ def train_step(
     key = jax.random.fold_in(state.key, state.step)
     adversary = (state.discriminator, state.discriminator_optimizer) if adversarial else None
     gradient_of = jax.value_and_grad(partial(total_loss, config), has_aux=True)
-    if jax.default_backend() == "cpu":  # under vmap a kernel for each run would be a grouped convolution, slow in XLA
+    if jax.default_backend() == "cpu":  # vmap over runs batches the kernels: grouped convolutions, slow in XLA
         gradient_of = jax.custom_batching.sequential_vmap(gradient_of)
     (loss, (metrics, batch_stats, adversary)), gradient = gradient_of(
         state.generator, state.batch_stats, adversary, batch, key, state.step

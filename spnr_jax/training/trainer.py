@@ -76,8 +76,9 @@ def train(
         for done, batch in enumerate(batches, start=first + 1):
             if first < joins == done - 1:
                 tqdm.write(f"step {joins}: the discriminator joins; the training step is compiled anew")
+            # another program compiles in its first step, which is left out of the time per step
             program = done > joins, jax.tree.structure(batch), tuple(np.shape(x) for x in jax.tree.leaves(batch))
-            with nullcontext() if program in compiled else log.untimed(state):
+            with nullcontext() if program in compiled else log.leave_out_compilation(state):
                 state, metrics = take_step(state, batch, config, mesh, adversarial=done > joins)
                 log.step(done, metrics)
             compiled.add(program)
@@ -88,14 +89,14 @@ def train(
             if save:
                 check_state(state)
             if last or done % schedule.preview_every == 0:
-                with log.paused():
+                with log.pause():
                     scores, picture = preview(state, config, dataset, run, light)
                     runtime.trim_memory()
                 log.write({"step": done, **scores}, picture)
             if last:
                 write_network(run, config, state)
             if save:  # after the rows up to this step: a continued run does not write them again
-                with log.paused():
+                with log.pause():
                     checkpoint.save(run, state)
             if stopping and not last:
                 raise KeyboardInterrupt(f"stopped at step {done} of {config.num_steps}; {GOES_ON}")
@@ -218,7 +219,7 @@ class MetricsLog:
         self._file = path.open("a")
         self._board = SummaryWriter(str(run / "tensorboard"), purge_step=first_step + 1)
         self._bar = tqdm(total=num_steps, initial=first_step, unit="step", mininterval=1)
-        self._untimed, self._since = 0, time.monotonic()
+        self._compiling_steps, self._since = 0, time.monotonic()
         self._pending: list[tuple[int, dict]] = []
 
     def step(self, done: int, metrics: dict) -> None:
@@ -227,14 +228,14 @@ class MetricsLog:
         self._bar.update()
 
     @contextmanager
-    def untimed(self, state: Any) -> Iterator[None]:
+    def leave_out_compilation(self, state: Any) -> Iterator[None]:
         """A step that compiles, taken inside: it is waited for, and does not count as step time."""
         jax.block_until_ready(state)
-        with self.paused():
+        with self.pause():
             yield
             jax.block_until_ready(self._pending[-1])
-        self._untimed += 1
-        if self._untimed == len(self._pending):  # the wait for the first batch is no step, either
+        self._compiling_steps += 1
+        if self._compiling_steps == len(self._pending):  # the wait for the first batch is no step, either
             self._since = time.monotonic()
 
     def mean(self) -> dict[str, int | float]:
@@ -246,14 +247,14 @@ class MetricsLog:
         done, newest = rows[-1]
         row = {"step": done} | {name: float(np.mean([m[name] for _, m in rows if name in m])) for name in newest}
         now = time.monotonic()
-        if timed := len(rows) - self._untimed:
+        if timed := len(rows) - self._compiling_steps:
             row["ms_per_step"] = round(1000 * (now - self._since) / timed, 2)
-        self._untimed, self._since = 0, now
+        self._compiling_steps, self._since = 0, now
         self._bar.set_postfix({n: f"{newest[n]:.2f}" for n in ("loss", "psnr") if n in newest}, refresh=False)
         return row
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def pause(self) -> Iterator[None]:
         """Time spent inside does not count as step time."""
         begin = time.monotonic()
         yield

@@ -26,7 +26,7 @@ FACTORS = {"splat": 1.5, "nearest": 0.75}
 
 def methods():
     variables = optimisation.averaged_variables(checkpoint.restore(tiny_untrained.run(), CONFIG))
-    trivial = {name: evaluation.make_floor(name, FACTORS.get(name, 1.0)) for name in evaluation.FLOORS}
+    trivial = {name: evaluation.make_trivial(name, FACTORS.get(name, 1.0)) for name in evaluation.TRIVIAL}
     return {"paper": evaluation.make_method(variables, CONFIG), **trivial}
 
 
@@ -62,8 +62,8 @@ def test_opacity_is_compared_at_the_size_of_the_reference(results):
 
 def test_a_summary_is_the_mean_over_all_images_with_its_counts(results):
     outcome = tiny_untrained.evaluated()
-    assert set(outcome.summary["methods"]) == {"paper", *evaluation.FLOORS}
-    assert set(outcome.summary["paper_minus"]) == set(evaluation.FLOORS)
+    assert set(outcome.summary["methods"]) == {"paper", *evaluation.TRIVIAL}
+    assert set(outcome.summary["paper_minus"]) == set(evaluation.TRIVIAL)
     for table in outcome.summary["methods"].values():
         assert table["objects"] == len(NAMES)
         assert table["views"] == len(NAMES) * tiny_dataset.VIEWS
@@ -83,7 +83,7 @@ def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch)
 
     def score(factor, item):
         item = replace(item, cloud=data_sets.first_points(item, CONFIG.test_points))
-        image = evaluation.make_floor("splat", factor)(item).image
+        image = evaluation.make_trivial("splat", factor)(item).image
         return np.mean(metrics.psnr(image, jnp.asarray(data_sets.on_white(item.images))))
 
     means = {factor: np.mean([score(factor, item) for item in items]) for factor in evaluation.RADIUS_FACTORS}
@@ -99,7 +99,7 @@ def test_an_empty_training_split_is_an_error_that_names_it(tmp_path):
 
 def test_an_lpips_that_can_be_measured_is_in_the_scores_of_each_method(monkeypatch):
     monkeypatch.setattr(evaluation, "lpips", lambda image, reference: np.abs(image - reference).mean(axis=(1, 2, 3)))
-    asked = {"white": evaluation.make_floor("white")}
+    asked = {"white": evaluation.make_trivial("white")}
     result = evaluation.evaluate_object(asked, CONFIG, data_sets.read_object(tiny_dataset.dataset(), NAMES[0]))
     close(result.scores["white"]["lpips"], (1 - result.reference).mean(axis=(1, 2, 3)), rtol=1e-4)
 
