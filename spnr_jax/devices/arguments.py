@@ -13,7 +13,7 @@ import tyro
 from spnr_jax.errors import UserError
 
 # Parts of tyro's error box, which becomes one line: "╭─ Parsing error ─╮ │ ... invalid literal for int() with base 10:
-# 'x' ... │ Argument helptext: ... │" -> "... expected INT, got 'x'."  BOX: frame, marks of bold letters, and tyro's name
+# 'x' ... │ Argument helptext: ... │" -> "... expected INT, got 'x'."  BOX: frame, marks of bold, and tyro's name
 # for the whole command
 BOX = r"[╭╮╰╯│─•]+|-{4,}|\[/?bold\]|__tyro-dummy-inner__\."
 UNION = r"no type matching (?:\{None\}\|)?(.+?) could be instantiated from \[(.+?)\]\..*?(?= Argument helptext)"
