@@ -47,11 +47,7 @@ class Method:
 def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
     show = evaluation.make_method(variables, training)
-    return Method(
-        draw=lambda _, item: show(item.cloud, item.camera),
-        compiles=True,
-        has_opacity=training.model.method != "npbg",
-    )
+    return Method(draw=lambda _, item: show(item.cloud, item.camera), has_opacity=training.model.method != "npbg")
 
 
 def of_model(model: Model, quality: Quality = "best") -> Method:
@@ -81,24 +77,14 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
     return found
 
 
-def of_floor(name: str, factor: float) -> Method:
-    """A trivial renderer with the radius of its points, in point spacings."""
-    show = evaluation.make_floor(name, factor)
-    return Method(
-        draw=lambda _, item: show(item.cloud, item.camera),
-        compiles=True,
-        has_opacity=name != "white",
-        radius=None if name == "white" else factor,
-    )
-
-
 def floors(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dict[str, Method]:
     """The trivial renderers among these names, with the radius that is best on training objects."""
-    wanted = [name for name in reversed(evaluation.FLOORS) if name in names]
-    return {
-        name: of_floor(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
-        for name in wanted
-    }
+    found = {}
+    for name in (name for name in reversed(evaluation.FLOORS) if name in names):
+        radius = None if name == "white" else evaluation.choose_radius(dataset, config, name)
+        show = evaluation.make_floor(name, radius or 1.0)
+        found[name] = Method(draw=lambda _, item, show=show: show(item.cloud, item.camera), radius=radius)
+    return found
 
 
 def of_rgba(rgba: np.ndarray) -> Pictures:

@@ -150,7 +150,7 @@ def score_object(
 ) -> list[float]:
     """The scores COLUMNS of an object, means over its views, each in its own light."""
     pictures = draw_volume(model, model.encode(cloud, densify=densify), item, quality)
-    drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images.astype(np.float32) / 255, strict=True)
+    drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images, strict=True)
     found = [[getattr(one, name) for name in COLUMNS] for one in (measure_sharpness(*view) for view in drawn)]
     return np.nanmean(found, axis=0).tolist()
 

@@ -39,7 +39,6 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.report import Table
 from spnr_jax.training import weights
 
 COLUMNS = {  # head, decimals
@@ -87,11 +86,8 @@ def main(options: Fig3) -> None:
     rows = {name: partial(measure, options.points, method) for name, method in found.items()}
     shown = evaluation.pick_evenly(names, options.shown)
     measured = scores.measure_rows(options.out, rows, dataset, names, shown)
-    table = Table(
-        title=f"{len(names)} unseen objects, {options.points} points; {runtime.describe_hardware()}",
-        heads=tuple(head for head, _ in COLUMNS.values()),
-        rows=tuple(scores.score_row(name, objects, COLUMNS) for name, objects in measured.items()),
-    )
+    title = f"{len(names)} unseen objects, {options.points} points; {runtime.describe_hardware()}"
+    table = scores.score_table(title, measured, COLUMNS)
     results = asked | {"scores": measured, "hardware": runtime.describe_hardware()}
     results["data"] = dataset.settings.get("settings", {})
     picture = scores.gallery(options.out, rows, dataset, shown, None, 128)

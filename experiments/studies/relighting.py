@@ -33,7 +33,6 @@ from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures, check_known_light
-from spnr_jax.scoring.report import Table
 from spnr_jax.training.weights import load
 
 COLUMNS = {
@@ -139,12 +138,8 @@ def _write(out: Path, found: Found) -> None:
         for (light, count), objects in found.items()
         for method in METHODS
     }
-    table = Table(
-        title="Relighting",
-        heads=tuple(head for head, _ in COLUMNS.values()),
-        rows=tuple(scores.score_row(label, objects, COLUMNS) for label, objects in rows.items()),
-        note="Means over objects with 95 % intervals; pictures are never rescaled.",
-    )
+    note = "Means over objects with 95 % intervals; pictures are never rescaled."
+    table = scores.score_table("Relighting", rows, COLUMNS, note)
     results_folder.write(out, {"objects": rows, "hardware": runtime.describe_hardware()}, [table])
 
 

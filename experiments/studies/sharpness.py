@@ -142,7 +142,7 @@ def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, fl
 def under_true_opacity(
     image: Float[np.ndarray, "height width 3"],
     opacity: Float[np.ndarray, "height width"],
-    reference: Float[np.ndarray, "height width 4"],
+    true_opacity: Float[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width 3"]:
     """The picture's own colours under the reference's opacity: what it would be with perfect outlines, no holes.
 
@@ -152,17 +152,16 @@ def under_true_opacity(
     shown = opacity >= COVERED
     if shown.any():
         color = color[tuple(distance_transform_edt(~shown, return_distances=False, return_indices=True))]
-    alpha = reference[..., 3:]
-    return np.clip(color, 0, 1) * alpha + 1 - alpha
+    return np.clip(color, 0, 1) * true_opacity[..., None] + 1 - true_opacity[..., None]
 
 
 def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     """PSNR of the same colours under the true opacity."""
     found = []
     for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True):
-        reference = rgba.astype(np.float32) / 255
-        right = under_true_opacity(np.asarray(image), np.asarray(opacity), reference)
-        found.append(measure_sharpness(right, reference[..., 3], reference))
+        true_opacity = rgba[..., 3].astype(np.float32) / 255
+        right = under_true_opacity(np.asarray(image), np.asarray(opacity), true_opacity)
+        found.append(measure_sharpness(right, true_opacity, rgba))
     return {
         "psnr_true_opacity": [one.psnr for one in found],
         "inside_true_opacity": [one.psnr_inside for one in found],
@@ -233,8 +232,8 @@ def _row(
     row: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
 ) -> tuple[str, tuple[Cell, ...]]:
     times = (number(float(np.median([of[what] for of in found])), 2) for what in ("encode", "render"))
-    label, cells = scores.score_row(row, found, COLUMNS)
-    return label, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
+    cells = scores.score_row(found, COLUMNS)
+    return row, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
 
 
 def _pictures(options: SharpnessStudy, dataset: Dataset, rows: Mapping[str, Measure], names: Sequence[str]) -> None:
