@@ -14,6 +14,7 @@ from data_gen.shapes.primitives import (
     moulding,
     move,
     patch,
+    rounded_rectangle,
     superellipsoid,
     tube,
     turn,
@@ -92,8 +93,7 @@ def picture(rng) -> list[Piece]:
         tilted = [(finish, turn(move(mesh, y=-low), "x", -lean)) for finish, mesh in pieces]
         top = 0.6 * (height / 2 - low) * np.array([0, np.cos(np.radians(lean)), -np.sin(np.radians(lean))])
         foot = (0, 0.005, top[2] - top[1] * rng.uniform(0.3, 0.6))
-        strut = tube([foot, top], 1, section=np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (0.035, 0.006))
-        return [*tilted, (border, strut)]
+        return [*tilted, (border, tube([foot, top], 1, section=rounded_rectangle(0.07, 0.012)))]
     return pieces
 
 

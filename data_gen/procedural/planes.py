@@ -122,8 +122,8 @@ def jet(radius, long) -> tuple[Mesh, Mesh]:
     return move(pod, z=-long), move(fan, z=-long)
 
 
-def gear(rng, legs, radius) -> tuple[Mesh, Mesh]:
-    """(tyres, struts and rims): a wheel at the foot of each leg (top point, ground point)."""
+def gear(rng, trim, legs, radius) -> list[Piece]:
+    """A wheel at the foot of each leg (top point, ground point)."""
     tyre, rim = wheel(rng, radius, radius * 0.7)
     tyres, rest = [], []
     for top, foot in legs:
@@ -131,7 +131,7 @@ def gear(rng, legs, radius) -> tuple[Mesh, Mesh]:
         tyres.append(move(tyre, *hub))
         rest += [move(rim, *hub), tube([hub, top], radius * 0.3, segments=8)]
         rest.append(move(box((radius * 0.9, radius * 0.4, radius * 0.4)), *hub))
-    return merge(tyres), merge(rest)
+    return [(finishes.rubber(rng), merge(tyres)), (trim, merge(rest))]
 
 
 def body_profile(rng, nose, end, width):
@@ -170,8 +170,7 @@ def landing(rng, trim, width, front) -> list[Piece]:
     legs = [((s * width * 0.25, -width * 0.35, place), (s * x, down, place)) for s in (1, -1)]
     nose, rear = ((0, -width * 0.3, 0.4), (0, down, 0.4)), ((0, 0.0, -0.42), (0, -width * 0.5, -0.44))
     legs.append(nose if rng.random() < 0.6 else rear)
-    tyres, struts = gear(rng, legs, rng.uniform(0.022, 0.032))
-    return [(finishes.rubber(rng), tyres), (trim, struts)]
+    return gear(rng, trim, legs, rng.uniform(0.022, 0.032))
 
 
 def airliner(rng) -> list[Piece]:
@@ -215,8 +214,7 @@ def airliner(rng) -> list[Piece]:
         legs = [((0, -width * 0.4, 0.35), (0, down, 0.35))]
         place = front - root * 0.7
         legs += [((s * width * 0.5, low, place), (s * width * 0.55, down, place)) for s in (1, -1)]
-        tyres, struts = gear(rng, legs, 0.018)
-        pieces += [(finishes.rubber(rng), tyres), (white, struts)]
+        pieces += gear(rng, white, legs, 0.018)
     return pieces
 
 

@@ -36,15 +36,10 @@ class Finish(NamedTuple):
     tile: float = 1.0
 
 
-def linear(srgb) -> np.ndarray:
-    """Linear RGB of sRGB in [0, 1]."""
-    return srgb_to_linear(np.asarray(srgb, float))
-
-
 def hsv(hue, saturation, value) -> np.ndarray:
     """(3,) linear RGB of a hue, saturation and value in [0, 1], as a colour picker has them."""
     wheel = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
-    return np.clip(linear(value * (1 - saturation * (1 - wheel))), 0.02, 0.9)
+    return np.clip(srgb_to_linear(value * (1 - saturation * (1 - wheel))), 0.02, 0.9)
 
 
 def color(rng) -> np.ndarray:
