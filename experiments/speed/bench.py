@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments import entry_point
@@ -28,6 +29,7 @@ from experiments.comparison import results_folder
 from spnr_jax.config import EncoderConfig, LossConfig, OptimizerConfig, PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import require_at_least
+from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Batch, Camera, PointCloud
 from spnr_jax.method import inference
 from spnr_jax.scoring.report import Table, number, text
@@ -259,7 +261,9 @@ def make_arrays(batch: int, size: int, num_points: int) -> dict[str, np.ndarray]
     found = {
         "pos": np.where(is_sphere, SPHERE * sphere, BOX * box),
         "mat": rng.random((batch, num_points, 5)),
-        "c2w": np.stack([make_pose(*rng.uniform((0, -0.36), (2 * np.pi, 0.84))) for _ in range(batch)]),
+        "c2w": np.stack(
+            [cameras.orbit(*rng.uniform((0, -0.36), (2 * np.pi, 0.84)), DISTANCE, jnp.zeros(3)) for _ in range(batch)]
+        ),
         "focal": np.full(batch, FOCAL),
         "target": rng.random((batch, 3, size, size)),
         "cond": rng.random((batch, 3, size, size)),
@@ -294,13 +298,6 @@ def make_batch(arrays: Mapping[str, np.ndarray]) -> Batch:
         condition=images["cond"],
         condition_mask=images["mask"][..., 0] > 0.5,
     )
-
-
-def make_pose(azimuth: float, elevation: float) -> np.ndarray:
-    """Camera-to-world matrix (3, 4) that looks at the origin, y up, angles in radians."""
-    backward = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
-    return np.stack([right, np.cross(backward, right), backward, DISTANCE * backward], axis=-1)
 
 
 if __name__ == "__main__":
