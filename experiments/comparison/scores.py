@@ -55,22 +55,20 @@ def measure_rows(
     out: Path, rows: Mapping[str, Measure], dataset: Dataset, names: Sequence[str], shown: Sequence[str] = ()
 ) -> dict[str, list[dict[str, Any]]]:
     """What is measured of each object, by row; the first pictures of the objects that are shown are kept."""
-    found = {}
-    for row, measure in rows.items():
-        measured = partial(_measure, out, row, measure, dataset, shown)
-        found[row] = [
-            load_or_make(place_of(out, row, name, ".json"), partial(measured, name)) for name in tqdm(names, desc=row)
+
+    def measured(row: str, name: str) -> dict[str, Any]:
+        found, picture = rows[row](data_sets.read_object(dataset, name))
+        if name in shown:
+            images.write_whole(place_of(out, row, name, ".png"), images.png(picture))
+        return found
+
+    return {
+        row: [
+            load_or_make(place_of(out, row, name, ".json"), partial(measured, row, name))
+            for name in tqdm(names, desc=row)
         ]
-    return found
-
-
-def _measure(
-    out: Path, row: str, measure: Measure, dataset: Dataset, shown: Sequence[str], name: str
-) -> dict[str, Any]:
-    found, picture = measure(data_sets.read_object(dataset, name))
-    if name in shown:
-        images.write_whole(place_of(out, row, name, ".png"), images.png(picture))
-    return found
+        for row in rows
+    }
 
 
 def place_of(out: Path, row: str, name: str, suffix: str) -> Path:
@@ -154,7 +152,7 @@ def gallery(
     return images.png(figures.grid(cells, ["reference", *rows], names, size=size))
 
 
-def reference(dataset: Dataset, name: str, resolution: int | None = None) -> np.ndarray:
+def reference(dataset: Dataset, name: str, resolution: int | None) -> np.ndarray:
     """The first reference of an object on white."""
     return data_sets.on_white(cut(data_sets.read_object(dataset, name), views=1, resolution=resolution).images[0])
 

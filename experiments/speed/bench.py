@@ -139,12 +139,6 @@ def our_config(preset: str, mode: Mode = "train", objects: int = 1) -> TrainConf
     return dataclasses.replace(config, loss=loss, batch_objects=objects)
 
 
-def our_batch(config: TrainConfig) -> Batch:
-    """The benchmark's scene on the device."""
-    found = make_arrays(config.batch_objects, config.model.image_resolution, config.max_points)
-    return jax.device_put(make_batch(found))
-
-
 jitted_encode = jax.jit(inference.encode, static_argnames="config")
 jitted_render = jax.jit(inference.render, static_argnames="config")
 
@@ -152,7 +146,8 @@ jitted_render = jax.jit(inference.render, static_argnames="config")
 def our_side(preset: str, mode: Mode) -> tuple[Run, float]:
     """What to time, and the seconds that its compilation took."""
     config = our_config(preset, mode, BATCHES[preset])
-    run, start = function(config, our_batch(config), mode), time.perf_counter()
+    arrays = make_arrays(config.batch_objects, config.model.image_resolution, config.max_points)
+    run, start = function(config, jax.device_put(make_batch(arrays)), mode), time.perf_counter()
     run()
     first = time.perf_counter() - start
     return run, first - 1e-3 * min(turn(run, seconds=0))
