@@ -62,7 +62,7 @@ def content(rng) -> finishes.Finish:
     """What a frame shows: mostly a painting, at times a mirror."""
     if rng.random() < 0.85:
         return finishes.canvas(rng)
-    return finishes.Finish(finishes.material(np.full(3, rng.uniform(0.7, 0.92)), rng.uniform(0.05, 0.1), 1.0))
+    return finishes.finish(np.full(3, rng.uniform(0.7, 0.92)), rng.uniform(0.05, 0.1), 1.0)
 
 
 def border_finish(rng) -> finishes.Finish:
@@ -73,7 +73,7 @@ def border_finish(rng) -> finishes.Finish:
 def paper(rng) -> finishes.Finish:
     """Card of a mount: mostly pale."""
     tint = finishes.hsv(rng.random(), rng.uniform(0, 0.12), rng.uniform(0.75, 0.97))
-    return finishes.Finish(finishes.material(tint if rng.random() < 0.75 else finishes.color(rng), 0.9))
+    return finishes.finish(tint if rng.random() < 0.75 else finishes.color(rng), 0.9)
 
 
 def size(rng) -> tuple[float, float]:
@@ -124,7 +124,7 @@ def round_frame(rng) -> list[Piece]:
 def clock(rng) -> list[Piece]:
     """A dial with marks and hands in a round, square or petalled case; on the wall or on two feet."""
     case = border_finish(rng)
-    dial = finishes.Finish(finishes.material(finishes.color(rng), 0.6)) if rng.random() < 0.7 else finishes.print_(rng)
+    dial = finishes.finish(finishes.color(rng), 0.6) if rng.random() < 0.7 else finishes.print_(rng)
     dark = finishes.choose(rng, finishes.metal, finishes.plastic)
     radius, depth = rng.uniform(0.08, 0.3), rng.uniform(0.03, 0.07)
     pieces = [(dial, turn(cylinder(radius * 0.99, depth * 0.6, 48), "x", 90))]

@@ -56,7 +56,7 @@ def livery(rng) -> finishes.Finish:
             "sweep": patterns.step(v + 0.3 * side, rng.uniform(0.6, 0.9)),
         }[kind]
         picture = patterns.mix(picture, second if rng.random() < 0.6 else third, weight)
-    return finishes.Finish(finishes.material(picture, rng.uniform(0.15, 0.5), 0.0))
+    return finishes.finish(picture, rng.uniform(0.15, 0.5))
 
 
 def windows(picture_finish, rows, count) -> finishes.Finish:
@@ -68,7 +68,7 @@ def windows(picture_finish, rows, count) -> finishes.Finish:
     weight = sum(column * patterns.step(0.022 - np.abs(side - row), 0.0, 0.01) for row in rows)
     old = picture_finish.material
     picture = patterns.mix(old.base_color, np.full(3, 0.03), np.clip(weight, 0, 1))
-    return finishes.Finish(finishes.material(picture, old.roughness))
+    return finishes.finish(picture, old.roughness)
 
 
 def surface(root, tip, chord, thickness, sections=2) -> Mesh:
@@ -175,7 +175,7 @@ def landing(rng, trim, width, front) -> list[Piece]:
 
 def airliner(rng) -> list[Piece]:
     """A tube with swept wings and two to four jets, under the wings or at the tail."""
-    skin, white = livery(rng), finishes.Finish(finishes.material(finishes.color(rng), rng.uniform(0.2, 0.5)))
+    skin, white = livery(rng), finishes.finish(finishes.color(rng), rng.uniform(0.2, 0.5))
     accent, dark = finishes.car_paint(rng), finishes.glass(rng)
     width = rng.uniform(0.085, 0.15)
     z, size, rise = body_profile(rng, rng.uniform(0.1, 0.2), rng.uniform(0.3, 0.42), width)

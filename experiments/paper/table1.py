@@ -39,7 +39,6 @@ from spnr_jax.scoring.report import Cell, Table, duration, number, text
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
 NETWORKS = ("paper", "npbg", "point_nerf", "points2nerf")
-PAPER_SIZES = {128: "abo", 200: "shapenet"}
 Budget = Literal["quick", "tiny", "paper"]
 BUDGETS = {
     "quick": f"the tiny presets for {QUICK_STEPS} steps each, which shows that everything runs and nothing else",
@@ -121,8 +120,8 @@ def make_configs(options: Table1, size: int, category: str | None) -> dict[str, 
     """The training of each network for images of so many pixels; ValueError if the paper has no such size."""
     if options.budget != "paper":
         found = {name: PRESETS["tiny" if name == "paper" else f"{name}_tiny"]() for name in NETWORKS}
-    elif size in PAPER_SIZES:
-        paper = PAPER_SIZES[size] if size == 128 else f"shapenet_{category}"
+    elif size in (128, 200):
+        paper = "abo" if size == 128 else f"shapenet_{category}"
         found = {"paper": PRESETS[paper if paper in PRESETS else "shapenet_car"]()}
         found |= {name: published(size) for name, published in PUBLISHED.items()}
     else:

@@ -12,7 +12,7 @@ should show no blue.  Two columns are an oracle: the same colours under the refe
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -126,17 +126,18 @@ def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectDat
 
 def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, float]]:
     """The pictures, and seconds to encode and of a view, once all is compiled."""
-    for _ in range(1 + method.compiles):
-        begin = perf_counter()
-        scene = method.encode(item)
-        jax.block_until_ready(jax.tree.leaves(scene))
-        middle = perf_counter()
-    encode = middle - begin
-    for _ in range(1 + method.compiles):
-        begin = perf_counter()
-        pictures = method.draw(scene, item)
-        render = (perf_counter() - begin) / len(item.images)
-    return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode, "render": render}
+
+    def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
+        for _ in range(1 + method.compiles):
+            begin = perf_counter()
+            made = work()
+            jax.block_until_ready(jax.tree.leaves(made))
+        return made, perf_counter() - begin
+
+    scene, encode = take_time(lambda: method.encode(item))
+    pictures, render = take_time(lambda: method.draw(scene, item))
+    times = {"encode": encode, "render": render / len(item.images)}
+    return scores.enlarge(pictures, item.images.shape[1:3]), times
 
 
 def under_true_opacity(
