@@ -26,7 +26,7 @@ from experiments.comparison.contenders import draw_volume
 from experiments.comparison.view_scores import measure_sharpness
 from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.config import Quality
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -69,7 +69,6 @@ class Recipe:
 
 def main(recipe: Recipe) -> None:
     """Runs each part in turn and prints its time."""
-    cli.set_up_jax()
     seconds = Seconds(recipe.out / "seconds.json")
     seconds.measure("data", lambda: generate(generation_of(recipe)))
     dataset = data_sets.open_dataset(recipe.out / "data")

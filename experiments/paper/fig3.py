@@ -29,7 +29,6 @@ from experiments.comparison.contenders import Method, of_model
 from experiments.comparison.scores import OPAQUE, Measured
 from experiments.comparison.study_objects import cut, each_view, test_objects
 from experiments.comparison.view_scores import mean
-from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -77,7 +76,6 @@ class Fig3:
 
 def main(options: Fig3) -> None:
     """Makes what is missing of the scores, then table and picture."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, 2 if options.quick else options.objects)
     found = all_methods(options.runs)

@@ -29,7 +29,6 @@ from experiments.comparison.contenders import LABELS, Method
 from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from experiments.comparison.variants import QUICK_STEPS, Trained, Variant
-from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
@@ -84,7 +83,6 @@ class Table1:
 
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes tables and pictures."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
     first = data_sets.read_object(dataset, names[0])

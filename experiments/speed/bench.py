@@ -75,7 +75,7 @@ def main(options: Options) -> None:
         out = options.out.with_name(f"{options.out.name}-quick")
         options = dataclasses.replace(options, out=out, presets=("tiny",), rounds=2, seconds=0.1)
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
-    runtime.reuse_memory()
+    jax.config.update("jax_enable_compilation_cache", False)  # what compiling takes is measured
     load, rows = runtime.measure_load(), rows_of(options)
     note = f"{runtime.describe_hardware()}, load before {load}; {time.strftime('%Y-%m-%d')}"
     results_folder.write(options.out, {"rows": rows}, [table(rows)], [note])

@@ -36,7 +36,6 @@ import spnr_jax
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
 from experiments.comparison.study_objects import cut
-from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.formats import data_sets, images
@@ -108,7 +107,6 @@ class Truth(NamedTuple):
 
 def main(options: InverseStudy) -> None:
     """Recovers all, compares gradients with differences, and writes tables and pictures."""
-    cli.set_up_jax()
     if options.quick:
         options = dataclasses.replace(options, points=128, size=32, steps=3)
     size, steps = options.size, options.steps

@@ -23,7 +23,6 @@ from experiments.comparison import figures, results_folder, scores
 from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
-from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
@@ -70,7 +69,6 @@ class RelightingStudy:
 
 def main(options: RelightingStudy) -> None:
     """Draws, scores and writes."""
-    cli.set_up_jax()
     model = load(options.run)
     found: Found = {}
     columns: dict[str, list[np.ndarray]] = {}

@@ -31,7 +31,6 @@ from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
 from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
-from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
@@ -84,7 +83,6 @@ class SharpnessStudy:
 
 def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
     asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}

@@ -210,17 +210,11 @@ def test_halving_averages_squares_and_an_odd_side_is_resized_first():
 # --- Point-NeRF -------------------------------------------------------------------------------------------------------
 
 CONFIG = POINT_NERF
-MODULE = PointNeRF(CONFIG)
 
 
 @pytest.fixture(scope="module")
 def variables():
-    return wobbled(jax.jit(MODULE.init)(jax.random.key(0), cloud(), camera()), 4)
-
-
-@jax.jit
-def whole(variables, cloud, camera):
-    return MODULE.apply(variables, cloud, camera)
+    return wobbled(jax.jit(PointNeRF(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 def waves(x, frequencies):
@@ -299,10 +293,10 @@ def test_the_picture_is_that_of_the_plain_loops(variables, monkeypatch):
 
 def test_without_a_point_in_reach_the_picture_is_exactly_white_and_empty(variables):
     empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
-    rendering = whole(variables, empty, camera())
+    rendering = tiny_model.render(variables, empty, camera(), config=CONFIG)
     assert (rendering.image == 1).all()
     assert (rendering.acc == 0).all()
-    away = whole(variables, cloud(), camera(target=5.0))
+    away = tiny_model.render(variables, cloud(), camera(target=5.0), config=CONFIG)
     missed = np.asarray(away.acc == 0)
     assert missed.any()
     assert (np.asarray(away.image)[missed] == 1).all()

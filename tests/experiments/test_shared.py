@@ -1,6 +1,10 @@
 """What every experiment stands on: networks, scores, tables, a folder that goes on."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +17,16 @@ from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
 from spnr_jax.training.gbuffers import average_squares
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_false_alarms_of_cached_programs_are_hidden_before_jax_is_imported():
+    code = "import os, sys, experiments; print('jax' in sys.modules, os.environ['TF_CPP_MIN_LOG_LEVEL'])"
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "False 3\n"
 
 
 @pytest.mark.parametrize(
