@@ -47,7 +47,12 @@ class Method:
 def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
     show = evaluation.make_method(variables, training)
-    return Method(draw=lambda _, item: show(item.cloud, item.camera), has_opacity=training.model.method != "npbg")
+    return Method(draw=draw_with(show), has_opacity=training.model.method != "npbg")
+
+
+def draw_with(show: evaluation.Method) -> Callable[[Any, ObjectData], Pictures]:
+    """A method of the evaluation, which encodes nothing beforehand, as `Method.draw`."""
+    return lambda _, item: show(item.cloud, item.camera)
 
 
 def of_model(model: Model, quality: Quality = "best") -> Method:
@@ -82,8 +87,7 @@ def floors(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dic
     found = {}
     for name in (name for name in reversed(evaluation.FLOORS) if name in names):
         radius = None if name == "white" else evaluation.choose_radius(dataset, config, name)
-        show = evaluation.make_floor(name, radius or 1.0)
-        found[name] = Method(draw=lambda _, item, show=show: show(item.cloud, item.camera), radius=radius)
+        found[name] = Method(draw=draw_with(evaluation.make_floor(name, radius or 1.0)), radius=radius)
     return found
 
 

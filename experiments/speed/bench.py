@@ -257,7 +257,10 @@ def make_arrays(batch: int, size: int, num_points: int) -> dict[str, np.ndarray]
         "pos": np.where(is_sphere, SPHERE * sphere, BOX * box),
         "mat": rng.random((batch, num_points, 5)),
         "c2w": np.stack(
-            [cameras.orbit(*rng.uniform((0, -0.36), (2 * np.pi, 0.84)), DISTANCE, jnp.zeros(3)) for _ in range(batch)]
+            [
+                cameras.orbit(azimuth, elevation, DISTANCE, jnp.zeros(3))
+                for azimuth, elevation in rng.uniform((0, -0.36), (2 * np.pi, 0.84), (batch, 2))
+            ]
         ),
         "focal": np.full(batch, FOCAL),
         "target": rng.random((batch, 3, size, size)),
