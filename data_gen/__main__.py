@@ -44,17 +44,13 @@ def main(arguments: list[str] | None = None) -> None:
 
 def parse(arguments: list[str]) -> Command:
     """The command with all its options; the preset named by --preset gives the defaults of the others."""
-    generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=preset_defaults(arguments))]
+    preset = PRESETS.get(take_option(arguments, "--preset")[0] or "")  # another name is refused with the other options
+    defaults = preset(tyro.MISSING) if preset else GenerateConfig(out=tyro.MISSING)
+    generate_options = Annotated[GenerateConfig, tyro.conf.subcommand("generate", default=defaults)]
     check_options = Annotated[CheckConfig, tyro.conf.subcommand("check")]
     show_options = Annotated[ShowConfig, tyro.conf.subcommand("show")]
     commands = generate_options | check_options | show_options
     return parse_options(commands, "spnr-data", arguments, DESCRIPTION, ("generate", "check", "show"))
-
-
-def preset_defaults(arguments: list[str]) -> GenerateConfig:
-    """What --preset among the arguments stands for; a name that there is not is refused with the other options."""
-    preset = PRESETS.get(take_option(arguments, "--preset")[0] or "")
-    return preset(tyro.MISSING) if preset else GenerateConfig(out=tyro.MISSING)
 
 
 def run(config: Command) -> int:

@@ -1,1 +1,5 @@
 """One file per table or figure; each is a command with --help, and writes pictures beside its numbers."""
+
+from spnr_jax.devices import runtime
+
+runtime.hide_false_alarms()  # here, because the modules of this folder import JAX

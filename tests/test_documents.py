@@ -1,8 +1,8 @@
 """What the documents show runs, and the signatures that they show are the code's; `make docs` checks the rest."""
 
 import ast
-import importlib
 import inspect
+import pkgutil
 import re
 import shutil
 import tomllib
@@ -137,7 +137,7 @@ def test_the_signatures_that_the_api_shows_are_those_of_the_code():
     shown = SIGNATURE.findall((DOCS / "api.md").read_text())
     assert len(shown) > 30
     for name, arguments in shown:
-        parameters = inspect.signature(resolve(f"spnr_jax.{name}")).parameters
+        parameters = inspect.signature(pkgutil.resolve_name(f"spnr_jax.{name}")).parameters
         wanted = {n: p for n, p in parameters.items() if n != "self"}
         given = dict(PARAMETER.findall(arguments))
         assert list(given) == list(wanted), name
@@ -146,20 +146,6 @@ def test_the_signatures_that_the_api_shows_are_those_of_the_code():
             assert optional == bool(default), f"{name}: {parameter}"
             if default not in ("", "...", "print", "Cut()"):
                 assert wanted[parameter].default == ast.literal_eval(default), f"{name}: {parameter}"
-
-
-def resolve(name):
-    """The module, class or function of a dotted name."""
-    parts = name.split(".")
-    for length in range(len(parts), 0, -1):
-        try:
-            found = importlib.import_module(".".join(parts[:length]))
-        except ModuleNotFoundError:
-            continue
-        for part in parts[length:]:
-            found = getattr(found, part)
-        return found
-    raise AssertionError(f"there is no {name}")
 
 
 def test_the_extras_that_the_documents_name_exist():

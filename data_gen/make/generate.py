@@ -63,17 +63,16 @@ def describe_light(config: GenerateConfig) -> dict:
     """What lights the pictures: names and checksums of maps, never where they lie."""
     white = {"white_sphere_radiance": light.WHITE_SPHERE_RADIANCE}
     if config.lights:
-        return {"kinds": [describe_kind(name) for name in config.lights], **white}
+        kinds = [
+            {"name": name}
+            if name in ("room", "random")
+            else {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
+            for name in config.lights
+        ]
+        return {"kinds": kinds, **white}
     if config.envmap:
         return {"name": config.envmap.name, "sha256": checksum_of(config.envmap), **white}
     return {"name": "procedural room", "sha256": None, **white}
-
-
-def describe_kind(name: str) -> dict:
-    """One kind of `--lights`."""
-    if name in ("room", "random"):
-        return {"name": name}
-    return {"name": "maps", "sha256": {file.name: checksum_of(file) for file in light.map_files(name)}}
 
 
 def describe_ids(ids: Sequence[str]) -> dict:

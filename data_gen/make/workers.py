@@ -11,7 +11,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from multiprocessing import connection, resource_tracker
 from typing import Any
@@ -68,11 +68,20 @@ def _run_once(function: Callable, state: Any, tasks: Iterable, num_workers: int)
 
 
 def _start(function: Callable, state: Any, task: Any, processes: list) -> connection.Connection:
-    """The pipe to a new worker, which has begun with a task."""
+    """The pipe to a new worker, which has begun with a task.
+
+    It has one thread, and ignores Ctrl-C, which reaches all processes of a terminal.
+    """
     ours, theirs = PROCESSES.Pipe()
     processes.append(PROCESSES.Process(target=_work, args=(theirs, function, state), daemon=True))
-    with _prepare_start():
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    resource_tracker.ensure_running()  # else it starts with the first worker, and unblocks the signal at that
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
         processes[-1].start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)  # a Ctrl-C that has waited is raised here
     theirs.close()  # so that the pipe ends with the worker
     _send(ours, task)
     return ours
@@ -82,19 +91,6 @@ def _send(pipe: connection.Connection, task: Any) -> None:
     """Gives a worker its next task; if it died meanwhile, reading the pipe shows that."""
     with suppress(BrokenPipeError):
         pipe.send(task)
-
-
-@contextmanager
-def _prepare_start() -> Iterator[None]:
-    """Processes that start meanwhile have one thread and ignore Ctrl-C, which reaches all processes of a terminal."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    resource_tracker.ensure_running()  # else it starts with the first worker, and unblocks the signal at that
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)  # a Ctrl-C that has waited is raised here
 
 
 def _work(tasks: connection.Connection, function: Callable, state: Any) -> None:

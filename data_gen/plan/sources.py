@@ -33,11 +33,11 @@ NAMED = 5  # files that an error message names
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """One object of a source: its mesh file, the folder that its files lie in, or why it cannot be used."""
+    """One object of a source: its mesh file, the folder that its files lie in (default: the mesh's own), its fault."""
 
     object_id: str
     path: Path
-    folder: Path
+    folder: Path | None = None
     fault: str = ""
 
 
@@ -83,7 +83,7 @@ def find_products(root: Path) -> list[Listed]:
         raise UserError(
             f"--root {root}: expected {FOLDER}/original/*/*.glb, as in the ABO 3D download; {describe_folder(root)}"
         )
-    return [Listed(object_id=path.stem, path=path, folder=path.parent) for path in paths]
+    return [Listed(object_id=path.stem, path=path) for path in paths]
 
 
 def find_meshes(folder: Path) -> list[tuple[str, Path]]:

@@ -172,11 +172,6 @@ def check_options(config: GenerateConfig) -> None:
     if unknown := set(config.categories) - set(procedural.CATEGORIES):
         known = ", ".join(procedural.CATEGORIES)
         raise UserError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")
-    check_source(config)
-
-
-def check_source(config: GenerateConfig) -> None:
-    """ValueError, naming the option, for options that do not say which objects are meant."""
     if config.meshes and config.preset:
         raise UserError(f"--meshes {config.meshes}: not together with --preset {config.preset}; give one of them")
     if config.root and not config.preset:
@@ -194,19 +189,15 @@ def source_of(config: GenerateConfig) -> tuple[Source, Category | None]:
     return "meshes" if config.meshes else "procedural", None
 
 
-def mesh_root(config: GenerateConfig) -> Path | None:
-    """The folder of the objects that are not procedural."""
-    return config.meshes or config.root
-
-
 def plan_objects(config: GenerateConfig) -> list[Task]:
     """Every product of the data set, sorted by id. A procedural object's id does not depend on --categories."""
-    num_objects = config.objects if config.objects is not None else 0 if mesh_root(config) else DEFAULT_OBJECTS
+    root = config.meshes or config.root
+    num_objects = config.objects if config.objects is not None else 0 if root else DEFAULT_OBJECTS
     wanted = set(config.categories or procedural.CATEGORIES)
     numbered = ((index, procedural.category_of(index)) for index in count())
     chosen = islice(((index, category) for index, category in numbered if category in wanted), num_objects)
     tasks = [Task(object_id=f"{category}_{index:06d}", category=category) for index, category in chosen]
-    if root := mesh_root(config):
+    if root:
         tasks += mesh_tasks(config, root)
     if not tasks:
         raise UserError("nothing to do: give --objects above 0, or --meshes with mesh files")
@@ -220,18 +211,13 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
 
 
 def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
-    """The objects of the source that are files, in any order."""
+    """The objects of the source that are files, in any order; paths are shown from its root: no private one is."""
     source, category = source_of(config)
     if source == "meshes":
-        found = sources.find_meshes(root)
-        return [Task(object_id=name, path=path, shown_path=show_path(path, root)) for name, path in found]
-    listed = sources.find_objects(root, category) if category else sources.find_products(root)
-    return [Task(**vars(x), category=category or "", shown_path=show_path(x.path, root)) for x in listed]
-
-
-def show_path(path: Path, root: Path) -> str:
-    """A file's path as it is reported: relative to the source's root, so that no private path is published."""
-    return path.relative_to(root).as_posix()
+        listed = [sources.Listed(object_id=name, path=path) for name, path in sources.find_meshes(root)]
+    else:
+        listed = sources.find_objects(root, category) if category else sources.find_products(root)
+    return [Task(**vars(x), category=category or "", shown_path=x.path.relative_to(root).as_posix()) for x in listed]
 
 
 def plan_data_set(config: GenerateConfig) -> Plan:

@@ -200,7 +200,7 @@ def fittings(rng, trim, half, sill, belt, axles) -> list[Piece]:
 def lamp_glass() -> finishes.Finish:
     """Head lamps at texture coordinate 0.25, tail lamps at 0.75: white and red in one material."""
     picture = np.repeat([[(0.85, 0.85, 0.85), (0.6, 0.03, 0.02)]], 8, axis=1).repeat(16, axis=0)
-    return finishes.Finish(finishes.material(picture, 0.12))
+    return finishes.finish(picture, 0.12)
 
 
 def wheels(rng, rubber, trim, radius, half, axles, thick) -> list[Piece]:

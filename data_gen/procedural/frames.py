@@ -14,6 +14,7 @@ from data_gen.shapes.primitives import (
     moulding,
     move,
     patch,
+    rounded_rectangle,
     superellipsoid,
     tube,
     turn,
@@ -61,7 +62,7 @@ def content(rng) -> finishes.Finish:
     """What a frame shows: mostly a painting, at times a mirror."""
     if rng.random() < 0.85:
         return finishes.canvas(rng)
-    return finishes.Finish(finishes.material(np.full(3, rng.uniform(0.7, 0.92)), rng.uniform(0.05, 0.1), 1.0))
+    return finishes.finish(np.full(3, rng.uniform(0.7, 0.92)), rng.uniform(0.05, 0.1), 1.0)
 
 
 def border_finish(rng) -> finishes.Finish:
@@ -72,7 +73,7 @@ def border_finish(rng) -> finishes.Finish:
 def paper(rng) -> finishes.Finish:
     """Card of a mount: mostly pale."""
     tint = finishes.hsv(rng.random(), rng.uniform(0, 0.12), rng.uniform(0.75, 0.97))
-    return finishes.Finish(finishes.material(tint if rng.random() < 0.75 else finishes.color(rng), 0.9))
+    return finishes.finish(tint if rng.random() < 0.75 else finishes.color(rng), 0.9)
 
 
 def size(rng) -> tuple[float, float]:
@@ -92,8 +93,7 @@ def picture(rng) -> list[Piece]:
         tilted = [(finish, turn(move(mesh, y=-low), "x", -lean)) for finish, mesh in pieces]
         top = 0.6 * (height / 2 - low) * np.array([0, np.cos(np.radians(lean)), -np.sin(np.radians(lean))])
         foot = (0, 0.005, top[2] - top[1] * rng.uniform(0.3, 0.6))
-        strut = tube([foot, top], 1, section=np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (0.035, 0.006))
-        return [*tilted, (border, strut)]
+        return [*tilted, (border, tube([foot, top], 1, section=rounded_rectangle(0.07, 0.012)))]
     return pieces
 
 
@@ -124,7 +124,7 @@ def round_frame(rng) -> list[Piece]:
 def clock(rng) -> list[Piece]:
     """A dial with marks and hands in a round, square or petalled case; on the wall or on two feet."""
     case = border_finish(rng)
-    dial = finishes.Finish(finishes.material(finishes.color(rng), 0.6)) if rng.random() < 0.7 else finishes.print_(rng)
+    dial = finishes.finish(finishes.color(rng), 0.6) if rng.random() < 0.7 else finishes.print_(rng)
     dark = finishes.choose(rng, finishes.metal, finishes.plastic)
     radius, depth = rng.uniform(0.08, 0.3), rng.uniform(0.03, 0.07)
     pieces = [(dial, turn(cylinder(radius * 0.99, depth * 0.6, 48), "x", 90))]

@@ -90,7 +90,7 @@ def stem(rng, height: float, radius: float) -> Mesh:
     return merge([loft(rings), cylinder(thick, height, 10)])
 
 
-def bulb(radius=0.028) -> Mesh:
+def bulb(radius) -> Mesh:
     """A bulb about 0 with its screw below."""
     ball = superellipsoid((2 * radius, 2.3 * radius, 2 * radius), 1, 1, 8, 12)
     return merge([ball, move(cylinder(radius * 0.5, radius, 10), y=-1.8 * radius)])

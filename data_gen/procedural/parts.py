@@ -141,7 +141,7 @@ def leg_style(rng, radius: float) -> Leg:
 
 def four_legs(leg: Leg, width: float, depth: float, height: float, splay=0.0) -> Mesh:
     """Four legs under a rectangle of (width, depth) up to a height; feet `splay` further out."""
-    corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (width / 2, depth / 2)
+    corners = rounded_rectangle(width, depth)
     out = np.sign(corners) * splay
     return merge(
         leg(np.array([x + a, 0, z + b]), np.array([x, height, z])) for (x, z), (a, b) in zip(corners, out, strict=True)

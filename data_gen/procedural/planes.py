@@ -56,7 +56,7 @@ def livery(rng) -> finishes.Finish:
             "sweep": patterns.step(v + 0.3 * side, rng.uniform(0.6, 0.9)),
         }[kind]
         picture = patterns.mix(picture, second if rng.random() < 0.6 else third, weight)
-    return finishes.Finish(finishes.material(picture, rng.uniform(0.15, 0.5), 0.0))
+    return finishes.finish(picture, rng.uniform(0.15, 0.5))
 
 
 def windows(picture_finish, rows, count) -> finishes.Finish:
@@ -68,7 +68,7 @@ def windows(picture_finish, rows, count) -> finishes.Finish:
     weight = sum(column * patterns.step(0.022 - np.abs(side - row), 0.0, 0.01) for row in rows)
     old = picture_finish.material
     picture = patterns.mix(old.base_color, np.full(3, 0.03), np.clip(weight, 0, 1))
-    return finishes.Finish(finishes.material(picture, old.roughness))
+    return finishes.finish(picture, old.roughness)
 
 
 def surface(root, tip, chord, thickness, sections=2) -> Mesh:
@@ -122,8 +122,8 @@ def jet(radius, long) -> tuple[Mesh, Mesh]:
     return move(pod, z=-long), move(fan, z=-long)
 
 
-def gear(rng, legs, radius) -> tuple[Mesh, Mesh]:
-    """(tyres, struts and rims): a wheel at the foot of each leg (top point, ground point)."""
+def gear(rng, trim, legs, radius) -> list[Piece]:
+    """A wheel at the foot of each leg (top point, ground point)."""
     tyre, rim = wheel(rng, radius, radius * 0.7)
     tyres, rest = [], []
     for top, foot in legs:
@@ -131,7 +131,7 @@ def gear(rng, legs, radius) -> tuple[Mesh, Mesh]:
         tyres.append(move(tyre, *hub))
         rest += [move(rim, *hub), tube([hub, top], radius * 0.3, segments=8)]
         rest.append(move(box((radius * 0.9, radius * 0.4, radius * 0.4)), *hub))
-    return merge(tyres), merge(rest)
+    return [(finishes.rubber(rng), merge(tyres)), (trim, merge(rest))]
 
 
 def body_profile(rng, nose, end, width):
@@ -170,13 +170,12 @@ def landing(rng, trim, width, front) -> list[Piece]:
     legs = [((s * width * 0.25, -width * 0.35, place), (s * x, down, place)) for s in (1, -1)]
     nose, rear = ((0, -width * 0.3, 0.4), (0, down, 0.4)), ((0, 0.0, -0.42), (0, -width * 0.5, -0.44))
     legs.append(nose if rng.random() < 0.6 else rear)
-    tyres, struts = gear(rng, legs, rng.uniform(0.022, 0.032))
-    return [(finishes.rubber(rng), tyres), (trim, struts)]
+    return gear(rng, trim, legs, rng.uniform(0.022, 0.032))
 
 
 def airliner(rng) -> list[Piece]:
     """A tube with swept wings and two to four jets, under the wings or at the tail."""
-    skin, white = livery(rng), finishes.Finish(finishes.material(finishes.color(rng), rng.uniform(0.2, 0.5)))
+    skin, white = livery(rng), finishes.finish(finishes.color(rng), rng.uniform(0.2, 0.5))
     accent, dark = finishes.car_paint(rng), finishes.glass(rng)
     width = rng.uniform(0.085, 0.15)
     z, size, rise = body_profile(rng, rng.uniform(0.1, 0.2), rng.uniform(0.3, 0.42), width)
@@ -215,8 +214,7 @@ def airliner(rng) -> list[Piece]:
         legs = [((0, -width * 0.4, 0.35), (0, down, 0.35))]
         place = front - root * 0.7
         legs += [((s * width * 0.5, low, place), (s * width * 0.55, down, place)) for s in (1, -1)]
-        tyres, struts = gear(rng, legs, 0.018)
-        pieces += [(finishes.rubber(rng), tyres), (white, struts)]
+        pieces += gear(rng, white, legs, 0.018)
     return pieces
 
 

@@ -7,6 +7,7 @@ from data_gen.shapes import finishes
 from data_gen.shapes.primitives import Mesh, box, cylinder, lathe, merge, move, superellipsoid, tube, turn
 
 BOARD = (0.012, 0.035)
+SQUARE = [(1, 1), (-1, 1), (-1, -1), (1, -1)]  # section of a post
 
 
 def carcass(width, height, depth, board) -> Mesh:
@@ -136,15 +137,14 @@ def ladder(rng) -> list[Piece]:
     top = body if rng.random() < 0.4 else finishes.choose(rng, finishes.wood, finishes.paint)
     width, height, depth = rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.9), rng.uniform(0.3, 0.5)
     count, rail, narrow = int(rng.integers(3, 6)), rng.uniform(0.012, 0.025), rng.uniform(0.3, 0.6)
-    section = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
-    square = section if rng.random() < 0.6 else None
+    section = SQUARE if rng.random() < 0.6 else None
     meshes = []
     for s in (1, -1):
         ends = [
             ((s * width / 2, 0, z), (s * width / 2, height, -depth / 2 + (z + depth / 2) * narrow))
             for z in (depth / 2, -depth / 2)
         ]
-        meshes += [tube(np.array(pair), rail, section=square) for pair in ends]
+        meshes += [tube(np.array(pair), rail, section=section) for pair in ends]
     books, pieces = finishes.swatches(rng), []
     for level in np.linspace(0.08, 0.97, count):
         deep = depth * (1 + (narrow - 1) * level)
@@ -162,9 +162,9 @@ def rack(rng) -> list[Piece]:
     width, height, depth = rng.uniform(0.5, 1.6), rng.uniform(0.7, 2.0), rng.uniform(0.3, 0.6)
     post, count = rng.uniform(0.01, 0.035), int(rng.integers(2, 6))
     levels = np.linspace(rng.uniform(0.04, 0.15), 0.98, count) * height
-    square = None if rng.random() < 0.4 else np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    section = None if rng.random() < 0.4 else SQUARE
     posts = [
-        tube([(x * width / 2, 0, z * depth / 2), (x * width / 2, height, z * depth / 2)], post, section=square)
+        tube([(x * width / 2, 0, z * depth / 2), (x * width / 2, height, z * depth / 2)], post, section=section)
         for x in (1, -1)
         for z in (1, -1)
     ]

@@ -5,7 +5,7 @@ import numpy as np
 from data_gen.procedural.parts import Piece, four_legs, leg_style, pedestal, round_legs, stretchers
 from data_gen.procedural.shelves import drawer_stack
 from data_gen.shapes import finishes
-from data_gen.shapes.primitives import Mesh, box, merge, move, prism, superellipse, tube, turn
+from data_gen.shapes.primitives import Mesh, box, merge, move, prism, rounded_rectangle, superellipse, tube, turn
 
 
 def table(rng) -> list[Piece]:
@@ -79,7 +79,7 @@ def trestle_base(rng, top, body, width, depth, height) -> list[Piece]:
     half, place = depth * rng.uniform(0.32, 0.45), width * rng.uniform(0.28, 0.42)
 
     def beam(start, end):
-        return tube([(0, *start), (0, *end)], thick / 2, section=[(1, 1), (-1, 1), (-1, -1), (1, -1)])
+        return tube([(0, *start), (0, *end)], thick / 2, section=rounded_rectangle(2, 2))
 
     if style == "t":
         foot = box((thick, 0.05, 2 * half), 0.012)

@@ -21,7 +21,7 @@ import numpy as np
 
 from data_gen.render.variant import mitsuba_module
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import Asset, Material, Part
+from spnr_jax.formats.assets import Asset, Part
 from spnr_jax.formats.data_sets import on_white
 from spnr_jax.kernels.imaging import linear_to_srgb
 
@@ -121,7 +121,8 @@ def mitsuba_mesh(part: Part, name: str):
     mi = mitsuba_module()
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "inner": principled(part)})
-    textured = has_texture(part.material)
+    channels = part.material.base_color, part.material.roughness, part.material.metallic
+    textured = max(map(np.ndim, channels)) > 1
     mesh = mi.Mesh(
         name,
         vertex_count=len(part.positions),
@@ -145,11 +146,6 @@ def mitsuba_mesh(part: Part, name: str):
         buffers["vertex_texcoords"] = np.asarray(part.texcoords, np.float32).ravel()
     buffers.update()
     return mesh
-
-
-def has_texture(material: Material) -> bool:
-    """Whether any channel of the material needs texture coordinates."""
-    return np.ndim(material.base_color) == 3 or np.ndim(material.roughness) == 2 or np.ndim(material.metallic) == 2
 
 
 def principled(part: Part) -> dict:

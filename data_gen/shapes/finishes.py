@@ -36,15 +36,10 @@ class Finish(NamedTuple):
     tile: float = 1.0
 
 
-def linear(srgb) -> np.ndarray:
-    """Linear RGB of sRGB in [0, 1]."""
-    return srgb_to_linear(np.asarray(srgb, float))
-
-
 def hsv(hue, saturation, value) -> np.ndarray:
     """(3,) linear RGB of a hue, saturation and value in [0, 1], as a colour picker has them."""
     wheel = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
-    return np.clip(linear(value * (1 - saturation * (1 - wheel))), 0.02, 0.9)
+    return np.clip(srgb_to_linear(value * (1 - saturation * (1 - wheel))), 0.02, 0.9)
 
 
 def color(rng) -> np.ndarray:
@@ -62,14 +57,15 @@ def color(rng) -> np.ndarray:
     return hsv(0.02 + 0.12 * hue, 0.25 + 0.5 * a, 0.25 + 0.6 * b)
 
 
-def material(base_color, roughness, metallic=0.0) -> Material:
-    """Material of values or pictures, rounded to 8 bits where they are pictures."""
+def finish(base_color, roughness, metallic=0.0, tile=1.0) -> Finish:
+    """Finish of values or pictures, rounded to 8 bits where they are pictures."""
 
     def channel(value):
         value = np.asarray(value, float)
         return np.asarray(np.round(value * 255) / 255 if value.ndim > 1 else value, np.float32)
 
-    return Material(base_color=channel(base_color), roughness=channel(roughness), metallic=channel(metallic))
+    made = Material(base_color=channel(base_color), roughness=channel(roughness), metallic=channel(metallic))
+    return Finish(made, tile)
 
 
 # ---------------------------------------------------------------- families
@@ -83,17 +79,17 @@ def wood(rng) -> Finish:
     grain = patterns.wood(rng)
     picture = np.clip(patterns.mix(light, dark, grain), 0.02, 0.9)
     gloss = rng.uniform(0.2, 0.6)
-    return Finish(material(picture, np.clip(gloss + 0.25 * (grain - 0.3), 0.05, 1)), rng.uniform(0.25, 0.6))
+    return finish(picture, np.clip(gloss + 0.25 * (grain - 0.3), 0.05, 1), tile=rng.uniform(0.25, 0.6))
 
 
 def paint(rng) -> Finish:
     """Plain colour, from matt to gloss."""
-    return Finish(material(color(rng), rng.uniform(0.15, 0.9)))
+    return finish(color(rng), rng.uniform(0.15, 0.9))
 
 
 def plastic(rng) -> Finish:
     """Plain colour, satin to shiny."""
-    return Finish(material(color(rng), rng.uniform(0.12, 0.5)))
+    return finish(color(rng), rng.uniform(0.12, 0.5))
 
 
 def metal(rng) -> Finish:
@@ -102,8 +98,8 @@ def metal(rng) -> Finish:
     tint = np.clip(color(rng), 0.05, 0.9) if rng.random() < 0.12 else tint  # anodised
     roughness = rng.uniform(0.05, 0.5)
     if rng.random() < 0.35:
-        return Finish(material(tint, np.clip(roughness + 0.6 * (patterns.brushed(rng) - 0.4), 0.05, 1), 1.0), 0.3)
-    return Finish(material(tint, roughness, 1.0))
+        return finish(tint, np.clip(roughness + 0.6 * (patterns.brushed(rng) - 0.4), 0.05, 1), 1.0, tile=0.3)
+    return finish(tint, roughness, 1.0)
 
 
 def fabric(rng) -> Finish:
@@ -115,7 +111,7 @@ def fabric(rng) -> Finish:
     if style != "plain":
         picture = patterns.mix(first, second, getattr(patterns, style)(rng))
     picture = np.clip(picture * (0.6 + 0.55 * cloth[..., None]), 0.02, 0.9)
-    return Finish(material(picture, rng.uniform(0.7, 1.0)), rng.uniform(0.12, 0.4))
+    return finish(picture, rng.uniform(0.7, 1.0), tile=rng.uniform(0.12, 0.4))
 
 
 def leather(rng) -> Finish:
@@ -123,7 +119,7 @@ def leather(rng) -> Finish:
     pebbles = patterns.leather(rng)
     base = color(rng) if rng.random() < 0.6 else np.array(WOODS[rng.integers(len(WOODS))])
     picture = np.clip(base * (0.75 + 0.3 * pebbles[..., None]), 0.02, 0.9)
-    return Finish(material(picture, np.clip(rng.uniform(0.4, 0.65) - 0.2 * pebbles, 0.05, 1)), rng.uniform(0.15, 0.3))
+    return finish(picture, np.clip(rng.uniform(0.4, 0.65) - 0.2 * pebbles, 0.05, 1), tile=rng.uniform(0.15, 0.3))
 
 
 def stone(rng) -> Finish:
@@ -132,43 +128,43 @@ def stone(rng) -> Finish:
     ground, vein = color(rng), color(rng)
     if rng.random() < 0.5:  # grey and beige stones
         ground, vein = (hsv(0.1, rng.uniform(0, 0.2), rng.uniform(0.1, 0.97)) for _ in range(2))
-    return Finish(material(patterns.mix(ground, vein, pattern), rng.uniform(0.1, 0.7)), rng.uniform(0.3, 0.8))
+    return finish(patterns.mix(ground, vein, pattern), rng.uniform(0.1, 0.7), tile=rng.uniform(0.3, 0.8))
 
 
 def print_(rng) -> Finish:
     """Painted or printed pattern of two colours on a smooth ground."""
     style = rng.choice(["stripes", "checks", "dots", "chevrons", "tiles", "speckles", "marble"])
     picture = patterns.mix(color(rng), color(rng), getattr(patterns, style)(rng))
-    return Finish(material(picture, rng.uniform(0.2, 0.8)), rng.uniform(0.2, 0.6))
+    return finish(picture, rng.uniform(0.2, 0.8), tile=rng.uniform(0.2, 0.6))
 
 
 def rattan(rng) -> Finish:
     """Coarse weave of straw or plastic."""
     light = np.array(WOODS[rng.integers(len(WOODS))]) if rng.random() < 0.6 else color(rng)
     straw = patterns.weave(rng)
-    return Finish(material(np.clip(light * (0.25 + straw[..., None]), 0.02, 0.9), rng.uniform(0.5, 0.9)), 0.25)
+    return finish(np.clip(light * (0.25 + straw[..., None]), 0.02, 0.9), rng.uniform(0.5, 0.9), tile=0.25)
 
 
 def car_paint(rng) -> Finish:
     """Coachwork: a shiny colour, now and then metallic."""
     metallic = rng.uniform(0.3, 0.9) if rng.random() < 0.3 else 0.0
-    return Finish(material(color(rng), rng.uniform(0.08, 0.35), metallic))
+    return finish(color(rng), rng.uniform(0.08, 0.35), metallic)
 
 
 def glass(rng) -> Finish:
     """Windows seen from outside: dark, smooth, opaque, tinted a little."""
-    return Finish(material(hsv(rng.random(), rng.uniform(0, 0.5), rng.uniform(0.12, 0.4)), rng.uniform(0.05, 0.12)))
+    return finish(hsv(rng.random(), rng.uniform(0, 0.5), rng.uniform(0.12, 0.4)), rng.uniform(0.05, 0.12))
 
 
 def rubber(rng) -> Finish:
     """Tyres and feet."""
-    return Finish(material(np.full(3, rng.uniform(0.02, 0.05)), rng.uniform(0.75, 1.0)))
+    return finish(np.full(3, rng.uniform(0.02, 0.05)), rng.uniform(0.75, 1.0))
 
 
 def glow(rng) -> Finish:
     """Lamp shades, bulbs and paper: light and dull, warm to white, at times coloured."""
     tint = hsv(rng.uniform(0.06, 0.16), rng.uniform(0.0, 0.35), rng.uniform(0.8, 0.97))
-    return Finish(material(tint if rng.random() < 0.5 else color(rng), rng.uniform(0.4, 1.0)))
+    return finish(tint if rng.random() < 0.5 else color(rng), rng.uniform(0.4, 1.0))
 
 
 ANY = (wood, paint, plastic, metal, fabric, leather, stone, print_, rattan)
@@ -184,7 +180,7 @@ def choose(rng, *families) -> Finish:
 def canvas(rng) -> Finish:
     """A painting that fills the unit square of texture coordinates."""
     picture = patterns.painting(rng, [color(rng) for _ in range(7)])
-    return Finish(material(picture, rng.uniform(0.3, 0.9)))
+    return finish(picture, rng.uniform(0.3, 0.9))
 
 
 SWATCHES = 12
@@ -197,4 +193,4 @@ def swatches(rng) -> Finish:
     lines *= 1 - patterns.step(np.abs((np.arange(64) + 0.5) / 64 - 0.5), rng.uniform(0.42, 0.46), 0.02)
     marks = np.stack([color(rng) for _ in range(SWATCHES)])
     picture = colors + lines[:, None, None] * rng.uniform(0, 0.8, (SWATCHES, 1)) * (marks - colors)
-    return Finish(material(np.repeat(picture, 128 // SWATCHES, axis=1), rng.uniform(0.3, 0.8)))
+    return finish(np.repeat(picture, 128 // SWATCHES, axis=1), rng.uniform(0.3, 0.8))

@@ -16,7 +16,7 @@ def grid() -> tuple[np.ndarray, np.ndarray]:
     return place[None, :], place[:, None]
 
 
-def noise(rng, frequency=(4.0, 4.0), slope=2.0) -> np.ndarray:
+def noise(rng, frequency, slope=2.0) -> np.ndarray:
     """(SIZE, SIZE) smooth noise about 0.5 of spread about 1/6, of some `frequency` (along u, along v) in waves a tile.
 
     White noise filtered to (1 + |f/frequency|^2)^(-slope): periodic, because its spectrum is the discrete one.

@@ -39,7 +39,7 @@ def rounded_rectangle(width: float, height: float, radius=0.0, steps=3) -> np.nd
     return (corners[:, None] * (width / 2 - radius, height / 2 - radius) + arcs).reshape(-1, 2)
 
 
-def curve(points, samples=16) -> np.ndarray:
+def curve(points, samples) -> np.ndarray:
     """(samples, 3 or 2) points of a Catmull-Rom curve through control points, ends included."""
     points = np.asarray(points, float)
     padded = np.concatenate([[2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]])
@@ -275,7 +275,7 @@ def tube(path, radius, *, segments=10, section=None) -> Mesh:
     return loft(rings)
 
 
-def superellipsoid(size, vertical=0.4, around=0.4, rows=12, segments=24) -> Mesh:
+def superellipsoid(size, vertical, around, rows=12, segments=24) -> Mesh:
     """Rounded solid of size (x, y, z) about 0: exponents 1 an ellipsoid, towards 0 a box; a cushion is about 0.4."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rows + 1)
     radius = np.abs(np.cos(latitude)) ** vertical

@@ -12,7 +12,7 @@ from data_gen.store import layout
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.records import PointCloud
 
 COUNTS = ("views", "resolution", "points")  # settings that the files of every object are compared with
 LEAST_AGREEMENT = 0.9  # of the visible points, on opaque pixels; the rest sit on silhouettes, where pixels are cut
@@ -115,21 +115,16 @@ def object_faults(data: Dataset, item: ObjectData, details: dict) -> list[str]:
         faults.append("lights.npz is there, but dataset.json says one light for all")
     for view in np.flatnonzero(~np.any(item.lights, axis=(1, 2, 3))) if item.lights is not None else ():
         faults.append(f"lights.npz: view {view} is lit by a black map")
-    return faults + camera_faults(item.camera) + point_faults(item.cloud, settings["points"])
+    rotations = np.asarray(item.camera.cam_to_world, np.float64)[:, :, :3]
+    products = rotations @ rotations.transpose(0, 2, 1)
+    if not np.allclose(products, np.eye(3), atol=1e-5) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-5):
+        faults.append("a camera's axes are not a right-handed orthonormal frame")
+    return faults + point_faults(item.cloud, settings["points"])
 
 
 def checksum_of(path: Path) -> str | None:
     """The SHA-256 of a file, or None if there is none."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
-
-
-def camera_faults(camera: Camera) -> list[str]:
-    """What is wrong with the cameras of one object."""
-    rotations = np.asarray(camera.cam_to_world, np.float64)[:, :, :3]
-    products = rotations @ rotations.transpose(0, 2, 1)
-    if not np.allclose(products, np.eye(3), atol=1e-5) or not np.allclose(np.linalg.det(rotations), 1, atol=1e-5):
-        return ["a camera's axes are not a right-handed orthonormal frame"]
-    return []
 
 
 def point_faults(cloud: PointCloud, count: int) -> list[str]:

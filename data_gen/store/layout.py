@@ -93,12 +93,8 @@ def list_completed(dataset: Path) -> set[str]:
 
 
 def write_object(dataset: Path, object_id: str, record: ObjectRecord) -> None:
-    """Write an object's folder, complete or not at all; if another writer was faster, its folder stays."""
-    write_folder(dataset / "objects" / object_id, object_files(record))
-
-
-def write_folder(place: Path, files: dict[str, bytes]) -> None:
-    """Write a folder beside its place and rename it."""
+    """Write an object's folder beside its place and rename it; if another writer was faster, its folder stays."""
+    place, files = dataset / "objects" / object_id, object_files(record)
     place.parent.mkdir(parents=True, exist_ok=True)
     owner = f"{UNFINISHED}{socket.gethostname()}-{os.getpid()}-"
     beside = Path(tempfile.mkdtemp(prefix=owner, dir=place.parent))

@@ -104,7 +104,8 @@ def visible_points(
 ) -> Int[Array, "height width"]:
     """Index of the point that each pixel of the camera shows, -1 where there is none."""
     pixels, _ = cameras.project(camera, positions)
-    depth = camera_depth(positions, camera)
+    offset = positions - camera.cam_to_world[None, :, 3]
+    depth = -jnp.einsum("ni,i->n", offset, camera.cam_to_world[:, 2], precision="highest")  # from the plane of the eye
     place = jnp.ceil(pixels) - 1  # on a border between pixels the one before it: exact halves round down
     limit = per_feature(jnp.array([camera.width, camera.height], jnp.float32), place)
     drawn = mask & (depth > near) & jnp.all((place >= 0) & (place < limit), axis=-1)
@@ -117,12 +118,6 @@ def visible_points(
     index = jnp.full(nowhere + 1, count).at[jnp.where(shown, flat, nowhere)].min(jnp.arange(count))
     index = index[:nowhere].reshape(camera.height, camera.width)
     return jnp.where(index < count, index, -1)
-
-
-def camera_depth(positions: Float[Array, "points 3"], camera: Camera) -> Float[Array, " points"]:
-    """Distance of each point from the plane of the eye, along the camera's line of sight."""
-    offset = positions - camera.cam_to_world[None, :, 3]
-    return -jnp.einsum("ni,i->n", offset, camera.cam_to_world[:, 2], precision="highest")
 
 
 def raster(

@@ -222,9 +222,8 @@ def point_features(cloud: PointCloud, frequencies: int) -> Float[Array, "points 
 
 def mlp(layers: Sequence[Layer], x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
     """Dense layers with a leaky ReLU after each."""
-    for kernel, bias in layers:
-        x = x @ kernel + per_feature(bias, x)
-        x = nn.leaky_relu(x, SLOPE)
+    for layer in layers:
+        x = nn.leaky_relu(dense(layer, x), SLOPE)
     return x
 
 
@@ -315,7 +314,7 @@ class PointNeRF(nn.Module):
 
     def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
         """Views of each cloud, some rays at a time; there is nothing to choose."""
-        return ray_chunks.render(self, cloud, camera, self.config.ray_chunk)
+        return ray_chunks.render(self, cloud, camera, self.rays(camera), self.config.ray_chunk)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras, all rays at once.  A key moves the candidates (training)."""

@@ -274,15 +274,7 @@ class Points2NeRF(nn.Module):
 
     def render(self, weights: Weights, camera: Camera, options: RenderOptions | None = None) -> Rendering:
         """Views of encoded objects, some rays at a time; there is nothing to choose."""
-        return ray_chunks.render(self, weights, camera, self.config.ray_chunk)
-
-    def whole(self, weights: Weights, camera: Camera, key: Key | None) -> Rendering:
-        """Views of encoded objects, all rays at once; a key jitters the samples (training)."""
-        return ray_chunks.as_images(camera, *self.render_rays(weights, self.rays(camera), key))
-
-    def rays(self, camera: Camera) -> Rays:
-        """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
-        return cameras.view_rays(camera)
+        return ray_chunks.render(self, weights, camera, cameras.view_rays(camera), self.config.ray_chunk)
 
     def render_rays(
         self, weights: Weights, rays: Rays, key: Key | None = None
@@ -298,13 +290,15 @@ class Points2NeRF(nn.Module):
         return compositing.composite(shares, rgb, WHITE), depth, jnp.sum(shares, axis=-1)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
-        """Views of each cloud from its cameras; training draws the codes with the key and adds the KL term."""
-        mean, log_variance = self.code(cloud)
-        if not train:
-            return self.whole(self.weights(mean), camera, key)
-        if key is None:
-            raise UserError("training draws a code for each object: give a key")
-        self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(mean, log_variance)))
-        code_key, key = jax.random.split(key)
-        code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(code_key, mean.shape)
-        return self.whole(self.weights(code), camera, key)
+        """Views of each cloud, all rays at once; a key jitters the samples.
+
+        Training draws the codes with the key and adds the KL term.
+        """
+        code, log_variance = self.code(cloud)
+        if train:
+            if key is None:
+                raise UserError("training draws a code for each object: give a key")
+            self.sow("losses", "kl", self.config.kl_weight * jnp.mean(kl_divergence(code, log_variance)))
+            code_key, key = jax.random.split(key)
+            code = code + jnp.exp(0.5 * log_variance) * jax.random.normal(code_key, code.shape)
+        return ray_chunks.as_images(camera, *self.render_rays(self.weights(code), cameras.view_rays(camera), key))

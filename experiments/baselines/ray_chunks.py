@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,10 +9,19 @@ from jaxtyping import Array, Float
 from spnr_jax.kernels.records import Camera, Rendering
 
 
-def render(module: Any, scene: Any, camera: Camera, chunk: int) -> Rendering:
-    """Views of encoded objects by a bound module with `rays` and `render_rays`, `chunk` rays of each object at once."""
+def render(module: Any, scene: Any, camera: Camera, rays: Any, chunk: int) -> Rendering:
+    """Views of encoded objects by a bound module's `render_rays`, `chunk` of the rays (objects, rays, ...) at once."""
     network, variables = module.unbind()
-    return as_images(camera, *_in_chunks(network, chunk, variables, scene, module.rays(camera)))
+    num_rays = jax.tree.leaves(rays)[0].shape[1]
+    chunk = min(chunk, num_rays)
+
+    def chunked(x):
+        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
+        return jnp.moveaxis(padded.reshape(x.shape[0], -1, chunk, *x.shape[2:]), 1, 0)
+
+    outputs = jax.lax.map(lambda rays: network.bind(variables).render_rays(scene, rays), jax.tree.map(chunked, rays))
+    flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)
+    return as_images(camera, *flat)
 
 
 def as_images(
@@ -26,16 +34,3 @@ def as_images(
     shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
     image = rgb.reshape(*shape, 3)
     return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
-
-
-def _in_chunks(module: nn.Module, chunk: int, variables: dict, scene: Any, rays: Any) -> Any:
-    """What the module's `render_rays` gives for rays (objects, rays, ...), so many of each object at a time."""
-    num_rays = jax.tree.leaves(rays)[0].shape[1]
-    chunk = min(chunk, num_rays)
-
-    def chunked(x):
-        padded = jnp.pad(x, ((0, 0), (0, -num_rays % chunk), *[(0, 0)] * (x.ndim - 2)), mode="edge")
-        return jnp.moveaxis(padded.reshape(x.shape[0], -1, chunk, *x.shape[2:]), 1, 0)
-
-    outputs = jax.lax.map(lambda rays: module.bind(variables).render_rays(scene, rays), jax.tree.map(chunked, rays))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :num_rays], outputs)

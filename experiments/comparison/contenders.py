@@ -47,11 +47,12 @@ class Method:
 def of_network(training: TrainConfig, variables: dict) -> Method:
     """A network as it was trained; NPBG predicts colours alone."""
     show = evaluation.make_method(variables, training)
-    return Method(
-        draw=lambda _, item: show(item),
-        compiles=True,
-        has_opacity=training.model.method != "npbg",
-    )
+    return Method(draw=draw_with(show), has_opacity=training.model.method != "npbg")
+
+
+def draw_with(show: evaluation.Method) -> Callable[[Any, ObjectData], Pictures]:
+    """A method of the evaluation, which encodes nothing beforehand, as `Method.draw`."""
+    return lambda _, item: show(item)
 
 
 def of_model(model: Model, quality: Quality = "best") -> Method:
@@ -81,24 +82,13 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
     return found
 
 
-def of_trivial(name: str, factor: float) -> Method:
-    """A trivial renderer with the radius of its points, in point spacings."""
-    show = evaluation.make_trivial(name, factor)
-    return Method(
-        draw=lambda _, item: show(item),
-        compiles=True,
-        has_opacity=name != "white",
-        radius=None if name == "white" else factor,
-    )
-
-
 def trivial_ones(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dict[str, Method]:
     """The trivial renderers among these names, with the radius that is best on training objects."""
-    wanted = [name for name in reversed(evaluation.TRIVIAL) if name in names]
-    return {
-        name: of_trivial(name, 1.0 if name == "white" else evaluation.choose_radius(dataset, config, name))
-        for name in wanted
-    }
+    found = {}
+    for name in (name for name in reversed(evaluation.TRIVIAL) if name in names):
+        radius = None if name == "white" else evaluation.choose_radius(dataset, config, name)
+        found[name] = Method(draw=draw_with(evaluation.make_trivial(name, radius or 1.0)), radius=radius)
+    return found
 
 
 def of_rgba(rgba: np.ndarray) -> Pictures:

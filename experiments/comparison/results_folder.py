@@ -48,24 +48,15 @@ def as_json(content: object) -> bytes:
 
 def load_or_make(place: Path, make: Callable[[], Any]) -> Any:
     """Content of a file, JSON or a picture (.png); computed and written first if it is missing."""
+    picture = place.suffix == ".png"
     if not place.is_file():
-        images.write_whole(place, WRITERS[place.suffix](make()))
-    return READERS[place.suffix](place)
-
-
-def _picture(place: Path) -> np.ndarray:
+        content = make()
+        encoded = images.png(content) if picture else (json.dumps(content, indent=1) + "\n").encode()  # NaN may be
+        images.write_whole(place, encoded)
+    if not picture:
+        return json.loads(place.read_text())
     with Image.open(place) as image:
         return np.asarray(image.convert("RGB"))
-
-
-WRITERS: dict[str, Callable[[Any], bytes]] = {
-    ".json": lambda content: (json.dumps(content, indent=1) + "\n").encode(),  # scores may be NaN
-    ".png": images.png,
-}
-READERS: dict[str, Callable[[Path], Any]] = {
-    ".json": lambda place: json.loads(place.read_text()),
-    ".png": _picture,
-}
 
 
 def write(

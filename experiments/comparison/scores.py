@@ -22,7 +22,7 @@ from experiments.comparison import figures
 from experiments.comparison.contenders import Method
 from experiments.comparison.results_folder import load_or_make
 from experiments.comparison.study_objects import cut
-from experiments.comparison.view_scores import measure_sharpness, over_white
+from experiments.comparison.view_scores import measure_sharpness
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData
@@ -30,7 +30,7 @@ from spnr_jax.kernels import metrics
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.scoring.picture_scores import Scores, flip, interval
-from spnr_jax.scoring.report import Cell, number
+from spnr_jax.scoring.report import Cell, Table, number
 
 Measured = tuple[dict[str, Any], np.ndarray]  # what is measured of an object, and its first picture
 Measure = Callable[[ObjectData], Measured]
@@ -54,22 +54,20 @@ def measure_rows(
     out: Path, rows: Mapping[str, Measure], dataset: Dataset, names: Sequence[str], shown: Sequence[str] = ()
 ) -> dict[str, list[dict[str, Any]]]:
     """What is measured of each object, by row; the first pictures of the objects that are shown are kept."""
-    found = {}
-    for row, measure in rows.items():
-        measured = partial(_measure, out, row, measure, dataset, shown)
-        found[row] = [
-            load_or_make(place_of(out, row, name, ".json"), partial(measured, name)) for name in tqdm(names, desc=row)
+
+    def measured(row: str, name: str) -> dict[str, Any]:
+        found, picture = rows[row](data_sets.read_object(dataset, name))
+        if name in shown:
+            images.write_whole(place_of(out, row, name, ".png"), images.png(picture))
+        return found
+
+    return {
+        row: [
+            load_or_make(place_of(out, row, name, ".json"), partial(measured, row, name))
+            for name in tqdm(names, desc=row)
         ]
-    return found
-
-
-def _measure(
-    out: Path, row: str, measure: Measure, dataset: Dataset, shown: Sequence[str], name: str
-) -> dict[str, Any]:
-    found, picture = measure(data_sets.read_object(dataset, name))
-    if name in shown:
-        images.write_whole(place_of(out, row, name, ".png"), images.png(picture))
-    return found
+        for row in rows
+    }
 
 
 def place_of(out: Path, row: str, name: str, suffix: str) -> Path:
@@ -87,8 +85,8 @@ def score_views(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     """The scores of COLUMNS of each view; pictures that are smaller than their references are enlarged."""
     pictures = enlarge(pictures, item.images.shape[1:3])
     views = [
-        score_view(np.asarray(image), np.asarray(opacity), rgba.astype(np.float32) / 255)
-        for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True)
+        score_view(np.asarray(image), np.asarray(opacity), reference)
+        for image, opacity, reference in zip(pictures.image, pictures.acc, item.images, strict=True)
     ]
     return {name: [view[name] for view in views] for name in COLUMNS}
 
@@ -104,12 +102,12 @@ def enlarge(pictures: Pictures, size: tuple[int, ...]) -> Pictures:
 
 
 def score_view(image: np.ndarray, opacity: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """The scores of COLUMNS of a picture beside its reference (RGBA, straight alpha); NaN where nothing is measured."""
-    white = over_white(reference)
+    """The scores of COLUMNS of a picture beside its reference (8-bit RGBA); NaN where nothing is measured."""
+    white = data_sets.on_white(reference)
     return measure_sharpness(image, opacity, reference)._asdict() | {
         "ssim": float(metrics.ssim(jnp.asarray(image), jnp.asarray(white))),
         "flip": float(flip(image, white)),
-        "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3]))),
+        "iou": float(metrics.opacity_iou(jnp.asarray(opacity), jnp.asarray(reference[..., 3] / np.float32(255)))),
     }
 
 
@@ -122,17 +120,24 @@ def mean_scores(scores: Mapping[str, Sequence[float]]) -> dict[str, float | None
     return found
 
 
-def score_row(
-    label: str, objects: Sequence[Mapping[str, Any]], columns: Mapping[str, tuple[str, int]] = COLUMNS
-) -> tuple[str, tuple[Cell, ...]]:
-    """A row of means over objects with intervals; None and NaN are left out."""
+def score_table(
+    title: str, rows: Mapping[str, Sequence[Mapping[str, Any]]], columns: Mapping[str, tuple[str, int]], note: str = ""
+) -> Table:
+    """A table of rows of objects under the heads of their columns."""
+    heads = tuple(head for head, _ in columns.values())
+    made = tuple((label, score_row(objects, columns)) for label, objects in rows.items())
+    return Table(title=title, heads=heads, rows=made, note=note)
+
+
+def score_row(objects: Sequence[Mapping[str, Any]], columns: Mapping[str, tuple[str, int]]) -> tuple[Cell, ...]:
+    """The cells of means over objects with intervals; None and NaN are left out."""
     cells = []
     for name, (_, decimals) in columns.items():
         values = np.array([of.get(name) for of in objects], float)
         known = values[~np.isnan(values)]
         mean, ends = (float(known.mean()), interval([x[None] for x in known])) if len(known) else (None, None)
         cells.append(number(mean, decimals, ends))
-    return label, tuple(cells)
+    return tuple(cells)
 
 
 def gallery(
@@ -146,7 +151,7 @@ def gallery(
     return images.png(figures.grid(cells, ["reference", *rows], names, size=size))
 
 
-def reference(dataset: Dataset, name: str, resolution: int | None = None) -> np.ndarray:
+def reference(dataset: Dataset, name: str, resolution: int | None) -> np.ndarray:
     """The first reference of an object on white."""
     return data_sets.on_white(cut(data_sets.read_object(dataset, name), views=1, resolution=resolution).images[0])
 
@@ -192,7 +197,7 @@ def score_objects(
         item = data_sets.read_object(dataset, name)
         result = evaluation.evaluate_object(shows, config, item)
         for label, pictures in result.pictures.items():
-            if not methods[label].has_opacity and label not in evaluation.TRIVIAL:
+            if not methods[label].has_opacity:
                 del result.scores[label]["iou"]  # it predicts colours alone
             if more:
                 result.scores[label] |= more(item, pictures)

@@ -1,13 +1,15 @@
 """Sharpness of a picture beside its reference: error inside the silhouette and along it, holes, detail.
 
-Pictures are sRGB in [0, 1] on white; references are RGBA with straight alpha, float in [0, 1]; lengths are pixels.
+Pictures are sRGB in [0, 1] on white; references are 8-bit RGBA with straight alpha; lengths are pixels.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+
+from spnr_jax.formats.data_sets import on_white
 
 OUTLINE = 3  # pixels to both sides of the true outline
 WELL_INSIDE = 4  # pixels from the outline
@@ -28,26 +30,20 @@ class Sharpness(NamedTuple):
 def measure_sharpness(
     image: Float[np.ndarray, "height width 3"],
     opacity: Float[np.ndarray, "height width"],
-    reference: Float[np.ndarray, "height width 4"],
+    reference: UInt8[np.ndarray, "height width 4"],
 ) -> Sharpness:
     """The scores of a picture; NaN where the reference has no pixel for a score."""
-    alpha = reference[..., 3]
-    white = over_white(reference)
+    alpha, white = reference[..., 3].astype(np.float32) / 255, on_white(reference)
     squared, body = (image - white) ** 2, alpha > 0.5
     outline = binary_dilation(body, iterations=OUTLINE) & ~binary_erosion(body, iterations=OUTLINE)
     deep = binary_erosion(body, iterations=WELL_INSIDE)
     return Sharpness(
         psnr=_decibels(squared),
-        psnr_inside=_decibels(squared[alpha > 0.999]),
+        psnr_inside=_decibels(squared[reference[..., 3] == 255]),
         outline_rmse=mean((opacity - alpha)[outline] ** 2) ** 0.5,
         holes=100 * mean(opacity[deep] < SOLID),
         detail=_correlation(_residue(image)[deep], _residue(white)[deep]),
     )
-
-
-def over_white(reference: Float[np.ndarray, "height width 4"]) -> Float[np.ndarray, "height width 3"]:
-    """RGB of straight-alpha float RGBA over white."""
-    return reference[..., :3] * reference[..., 3:] + 1 - reference[..., 3:]
 
 
 def mean(values: np.ndarray) -> float:

@@ -21,7 +21,7 @@ from typing import Any
 from data_gen.make.generate import generate
 from data_gen.plan.tasks import GenerateConfig
 from experiments import entry_point
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.config import TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -57,7 +57,6 @@ class Demo:
 
 def main(demo: Demo) -> None:
     """Runs the parts and says where the results are."""
-    cli.set_up_jax()
     seconds = Seconds(demo.out / "seconds.json")
     generation = generation_of(demo)
     configs = configs_of(demo)

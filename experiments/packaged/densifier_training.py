@@ -46,10 +46,8 @@ FEWEST = 300  # points of a cloud
 OFTEN = 0.35, 0.25, 0.1, 0.2, 0.1  # how often each cloud of a record trains: sparse ones are harder
 UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
-EXACT, ROBUST = (
-    0.08,
-    0.15,
-)  # spacings off the surface at which a learned point is half there, and errors begin to count less
+EXACT = 0.08  # spacings off the surface at which a learned point is half there
+ROBUST = 0.15  # and at which errors begin to count less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +377,9 @@ def train(options: Options) -> None:
     state = {"params": params, "rule": rule.init(params), "step": 0}
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():
-        state = restore(checkpoint, state)
+        leaves, structure = jax.tree.flatten(state)
+        found = read(checkpoint)
+        state = jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])
 
     @jax.jit
     def advance(params: dict, rule_state: Any, batch: Batch) -> tuple[dict, Any, dict[str, Array]]:
@@ -400,8 +400,8 @@ def train(options: Options) -> None:
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1
-            leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-            write_whole(checkpoint, pack_arrays(leaves))
+            kept = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+            write_whole(checkpoint, pack_arrays(kept))
             flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(state["params"], sep="/").items()}
             write_whole(options.out / "densifier.npz", pack_arrays(flat, compressed=True))
 
@@ -410,10 +410,3 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a record or a checkpoint."""
     with path.open("rb") as file:
         return read_arrays(file)
-
-
-def restore(path: Path, like: Any) -> Any:
-    """A state of this structure from a checkpoint."""
-    leaves, structure = jax.tree.flatten(like)
-    found = read(path)
-    return jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])

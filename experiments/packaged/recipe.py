@@ -26,7 +26,7 @@ from experiments.comparison.contenders import draw_volume
 from experiments.comparison.view_scores import measure_sharpness
 from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.config import Quality
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
@@ -69,7 +69,6 @@ class Recipe:
 
 def main(recipe: Recipe) -> None:
     """Runs each part in turn and prints its time."""
-    cli.set_up_jax()
     seconds = Seconds(recipe.out / "seconds.json")
     seconds.measure("data", lambda: generate(generation_of(recipe)))
     dataset = data_sets.open_dataset(recipe.out / "data")
@@ -150,7 +149,7 @@ def score_object(
 ) -> list[float]:
     """The scores COLUMNS of an object, means over its views, each in its own light."""
     pictures = draw_volume(model, model.encode(cloud, densify=densify), item, quality)
-    drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images.astype(np.float32) / 255, strict=True)
+    drawn = zip(np.clip(pictures.image, 0, 1), pictures.acc, item.images, strict=True)
     found = [[getattr(one, name) for name in COLUMNS] for one in (measure_sharpness(*view) for view in drawn)]
     return np.nanmean(found, axis=0).tolist()
 

@@ -24,7 +24,6 @@ import tyro
 from experiments import entry_point
 from experiments.comparison import variants
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -55,7 +54,6 @@ class Fig1:
 
 def main(options: Fig1) -> None:
     """Trains what is not trained, scores all weights, writes tables and pictures."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     runs = [variant(options, weight, options.budget.config(), dataset) for weight in options.l1_weights]
     reference = runs[options.l1_weights.index(100.0) if 100.0 in options.l1_weights else 0].name

@@ -21,7 +21,6 @@ import tyro
 from experiments import entry_point
 from experiments.comparison import figures, variants
 from experiments.comparison.variants import Budget, Variant
-from spnr_jax import cli
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, write_whole
@@ -43,7 +42,6 @@ class Fig2:
 
 def main(options: Fig2) -> None:
     """Trains what is not trained, scores both trainings, writes tables and pictures."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     runs = trainings(options, dataset)
     variants.study(options.out, "fig2", runs, "with", options.budget, dataset)

@@ -29,7 +29,6 @@ from experiments.comparison.contenders import Method, of_model
 from experiments.comparison.scores import OPAQUE, Measured
 from experiments.comparison.study_objects import cut, each_view, test_objects
 from experiments.comparison.view_scores import mean
-from spnr_jax import cli
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
@@ -39,7 +38,6 @@ from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.evaluation import Pictures
-from spnr_jax.scoring.report import Table
 from spnr_jax.training import weights
 
 COLUMNS = {  # head, decimals
@@ -78,7 +76,6 @@ class Fig3:
 
 def main(options: Fig3) -> None:
     """Makes what is missing of the scores, then table and picture."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, 2 if options.quick else options.objects)
     found = all_methods(options.runs)
@@ -87,11 +84,8 @@ def main(options: Fig3) -> None:
     rows = {name: partial(measure, options.points, method) for name, method in found.items()}
     shown = evaluation.pick_evenly(names, options.shown)
     measured = scores.measure_rows(options.out, rows, dataset, names, shown)
-    table = Table(
-        title=f"{len(names)} unseen objects, {options.points} points; {runtime.describe_hardware()}",
-        heads=tuple(head for head, _ in COLUMNS.values()),
-        rows=tuple(scores.score_row(name, objects, COLUMNS) for name, objects in measured.items()),
-    )
+    title = f"{len(names)} unseen objects, {options.points} points; {runtime.describe_hardware()}"
+    table = scores.score_table(title, measured, COLUMNS)
     results = asked | {"scores": measured, "hardware": runtime.describe_hardware()}
     results["data"] = dataset.settings.get("settings", {})
     picture = scores.gallery(options.out, rows, dataset, shown, None, 128)

@@ -29,7 +29,6 @@ from experiments.comparison.contenders import LABELS, Method
 from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from experiments.comparison.variants import QUICK_STEPS, Trained, Variant
-from spnr_jax import cli
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
@@ -39,7 +38,6 @@ from spnr_jax.scoring.report import Cell, Table, duration, number, text
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
 NETWORKS = ("paper", "npbg", "point_nerf", "points2nerf")
-PAPER_SIZES = {128: "abo", 200: "shapenet"}
 Budget = Literal["quick", "tiny", "paper"]
 BUDGETS = {
     "quick": f"the tiny presets for {QUICK_STEPS} steps each, which shows that everything runs and nothing else",
@@ -85,7 +83,6 @@ class Table1:
 
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes tables and pictures."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
     first = data_sets.read_object(dataset, names[0])
@@ -121,8 +118,8 @@ def make_configs(options: Table1, size: int, category: str | None) -> dict[str, 
     """The training of each network for images of so many pixels; ValueError if the paper has no such size."""
     if options.budget != "paper":
         found = {name: PRESETS["tiny" if name == "paper" else f"{name}_tiny"]() for name in NETWORKS}
-    elif size in PAPER_SIZES:
-        paper = PAPER_SIZES[size] if size == 128 else f"shapenet_{category}"
+    elif size in (128, 200):
+        paper = "abo" if size == 128 else f"shapenet_{category}"
         found = {"paper": PRESETS[paper if paper in PRESETS else "shapenet_car"]()}
         found |= {name: published(size) for name, published in PUBLISHED.items()}
     else:

@@ -263,10 +263,7 @@ def paper_config(c: TrainConfig) -> PaperConfig:
 def trainer(c: TrainConfig, compile: bool, adversarial: bool) -> Callable[[Batch], None]:
     """A training step: one forward of the generator, an update of the discriminator, an update of the generator."""
     model, groups = paper_config(c), paper_config(c).encoder.num_groups
-    generator, judge = (
-        Generator(model).train(),
-        Discriminator(c.loss.discriminator_width, groups).train(),
-    )
+    generator, judge = Generator(model).train(), Discriminator(c.loss.discriminator_width, groups).train()
     generator = compile_generator(generator) if compile else generator
     draw = torch.compile(judge, dynamic=False) if compile else judge
     betas = (0.5, 0.999)

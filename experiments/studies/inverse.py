@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int
 import spnr_jax
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
-from spnr_jax import cli
+from experiments.comparison.study_objects import cut
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.formats import data_sets, images
@@ -107,9 +107,12 @@ class Truth(NamedTuple):
 
 def main(options: InverseStudy) -> None:
     """Recovers all, compares gradients with differences, and writes tables and pictures."""
-    cli.set_up_jax()
-    size, steps = (32, 3) if options.quick else (options.size, options.steps)
-    params, objects = spnr_jax.load().params, read(options) if options.data else shapes(options)
+    if options.quick:
+        options = dataclasses.replace(options, points=128, size=32, steps=3)
+    size, steps = options.size, options.steps
+    params = spnr_jax.load().params
+    objects = read(options.data, options.points) if options.data else shapes(options.points)
+    objects = dict(list(objects.items())[: 2 if options.quick else 4])
     truths = [place(cloud, i, size) for i, cloud in enumerate(objects.values())]
     plan, tables, truth = make_plan(params, truths), jnp.asarray(basis()), stack(truths)
     found: dict[str, Any] = {}
@@ -130,18 +133,15 @@ def main(options: InverseStudy) -> None:
 # --- the truth --------------------------------------------------------------------------------------------------------
 
 
-def read(options: InverseStudy) -> dict[str, PointCloud]:
+def read(folder: Path, count: int) -> dict[str, PointCloud]:
     """The first four test objects of a data set, without normals."""
-    dataset = data_sets.open_dataset(options.data or Path())
-    items = {name: data_sets.read_object(dataset, name) for name in dataset.splits["test"][: 2 if options.quick else 4]}
-    count = 128 if options.quick else options.points
-    clouds = {name: data_sets.first_points(item, count) for name, item in items.items()}
-    return {name: dataclasses.replace(cloud, normals=None) for name, cloud in clouds.items()}
+    dataset = data_sets.open_dataset(folder)
+    items = {name: data_sets.read_object(dataset, name) for name in dataset.splits["test"][:4]}
+    return {name: cut(item, count).cloud for name, item in items.items()}
 
 
-def shapes(options: InverseStudy) -> dict[str, PointCloud]:
+def shapes(count: int) -> dict[str, PointCloud]:
     """A ball, a ring, a vase and a drop, painted in waves; the upper half is smooth and partly metal."""
-    count = 128 if options.quick else options.points
     u, v = ((np.arange(1, count + 1) / 1.32471795724474602596**k) % 1 for k in (1, 2))  # Roberts' R2 sequence
     height, turn = 2 * v - 1, 2 * np.pi * v
     outlines = {  # radius and height
@@ -151,7 +151,7 @@ def shapes(options: InverseStudy) -> dict[str, PointCloud]:
         "drop": (0.5 * np.sqrt(1 - height**2) * (1.2 - 0.8 * v), height),
     }
     clouds: dict[str, PointCloud] = {}
-    for name, (radius, y) in list(outlines.items())[: 2 if options.quick else 4]:
+    for name, (radius, y) in outlines.items():
         positions = np.stack([radius * np.sin(2 * np.pi * u), y, radius * np.cos(2 * np.pi * u)], axis=-1)
         color = 0.5 + 0.35 * np.sin(5 * positions + len(clouds) + np.arange(3))
         smooth, metal = np.where(y > 0, 0.3, 0.7), np.where((y > 0) & (u > 0.5), 0.8, 0)

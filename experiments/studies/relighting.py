@@ -23,7 +23,6 @@ from experiments.comparison import figures, results_folder, scores
 from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
-from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
@@ -33,7 +32,6 @@ from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.records import Volume
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures, check_known_light
-from spnr_jax.scoring.report import Table
 from spnr_jax.training.weights import load
 
 COLUMNS = {
@@ -71,7 +69,6 @@ class RelightingStudy:
 
 def main(options: RelightingStudy) -> None:
     """Draws, scores and writes."""
-    cli.set_up_jax()
     model = load(options.run)
     found: Found = {}
     columns: dict[str, list[np.ndarray]] = {}
@@ -139,12 +136,8 @@ def _write(out: Path, found: Found) -> None:
         for (light, count), objects in found.items()
         for method in METHODS
     }
-    table = Table(
-        title="Relighting",
-        heads=tuple(head for head, _ in COLUMNS.values()),
-        rows=tuple(scores.score_row(label, objects, COLUMNS) for label, objects in rows.items()),
-        note="Means over objects with 95 % intervals; pictures are never rescaled.",
-    )
+    note = "Means over objects with 95 % intervals; pictures are never rescaled."
+    table = scores.score_table("Relighting", rows, COLUMNS, note)
     results_folder.write(out, {"objects": rows, "hardware": runtime.describe_hardware()}, [table])
 
 

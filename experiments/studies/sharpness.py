@@ -12,7 +12,7 @@ should show no blue.  Two columns are an oracle: the same colours under the refe
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,6 @@ from experiments.comparison.poisson import Renderer
 from experiments.comparison.scores import Measure, Measured
 from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
-from spnr_jax import cli
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets, images
@@ -84,7 +83,6 @@ class SharpnessStudy:
 
 def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
     asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}
@@ -126,23 +124,24 @@ def measure(options: SharpnessStudy, method: Method, count: int, item: ObjectDat
 
 def draw_timed(method: Method, item: ObjectData) -> tuple[Pictures, dict[str, float]]:
     """The pictures, and seconds to encode and of a view, once all is compiled."""
-    for _ in range(1 + method.compiles):
-        begin = perf_counter()
-        scene = method.encode(item)
-        jax.block_until_ready(jax.tree.leaves(scene))
-        middle = perf_counter()
-    encode = middle - begin
-    for _ in range(1 + method.compiles):
-        begin = perf_counter()
-        pictures = method.draw(scene, item)
-        render = (perf_counter() - begin) / len(item.images)
-    return scores.enlarge(pictures, item.images.shape[1:3]), {"encode": encode, "render": render}
+
+    def take_time(work: Callable[[], Any]) -> tuple[Any, float]:
+        for _ in range(1 + method.compiles):
+            begin = perf_counter()
+            made = work()
+            jax.block_until_ready(jax.tree.leaves(made))
+        return made, perf_counter() - begin
+
+    scene, encode = take_time(lambda: method.encode(item))
+    pictures, render = take_time(lambda: method.draw(scene, item))
+    times = {"encode": encode, "render": render / len(item.images)}
+    return scores.enlarge(pictures, item.images.shape[1:3]), times
 
 
 def under_true_opacity(
     image: Float[np.ndarray, "height width 3"],
     opacity: Float[np.ndarray, "height width"],
-    reference: Float[np.ndarray, "height width 4"],
+    true_opacity: Float[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width 3"]:
     """The picture's own colours under the reference's opacity: what it would be with perfect outlines, no holes.
 
@@ -152,17 +151,16 @@ def under_true_opacity(
     shown = opacity >= COVERED
     if shown.any():
         color = color[tuple(distance_transform_edt(~shown, return_distances=False, return_indices=True))]
-    alpha = reference[..., 3:]
-    return np.clip(color, 0, 1) * alpha + 1 - alpha
+    return np.clip(color, 0, 1) * true_opacity[..., None] + 1 - true_opacity[..., None]
 
 
 def oracle(item: ObjectData, pictures: Pictures) -> dict[str, list[float]]:
     """PSNR of the same colours under the true opacity."""
     found = []
     for image, opacity, rgba in zip(pictures.image, pictures.acc, item.images, strict=True):
-        reference = rgba.astype(np.float32) / 255
-        right = under_true_opacity(np.asarray(image), np.asarray(opacity), reference)
-        found.append(measure_sharpness(right, reference[..., 3], reference))
+        true_opacity = rgba[..., 3].astype(np.float32) / 255
+        right = under_true_opacity(np.asarray(image), np.asarray(opacity), true_opacity)
+        found.append(measure_sharpness(right, true_opacity, rgba))
     return {
         "psnr_true_opacity": [one.psnr for one in found],
         "inside_true_opacity": [one.psnr_inside for one in found],
@@ -233,8 +231,8 @@ def _row(
     row: str, found: Sequence[Mapping[str, float | None]], known: Mapping[str, float | None]
 ) -> tuple[str, tuple[Cell, ...]]:
     times = (number(float(np.median([of[what] for of in found])), 2) for what in ("encode", "render"))
-    label, cells = scores.score_row(row, found, COLUMNS)
-    return label, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
+    cells = scores.score_row(found, COLUMNS)
+    return row, (*cells, *times, number(known.get("ball"), 4), number(known.get("plate"), 3))
 
 
 def _pictures(options: SharpnessStudy, dataset: Dataset, rows: Mapping[str, Measure], names: Sequence[str]) -> None:

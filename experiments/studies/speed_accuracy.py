@@ -34,7 +34,6 @@ from experiments.comparison import results_folder, scores
 from experiments.comparison.contenders import draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
-from spnr_jax import cli
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
@@ -191,7 +190,6 @@ class Row(NamedTuple):
 
 def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the tables and the plot."""
-    cli.set_up_jax()
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects)
     asked = {"objects": names, "views": options.views, "runs": options.runs}

@@ -25,7 +25,6 @@ from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains baselines
 
-MASKED = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=True)
 RADAM = OptimizerConfig(lr_generator=5e-3, warmup_steps=2, algorithm="radam", ema_decay=0.9)
 
 
@@ -35,7 +34,7 @@ def trained(config, **changes):
 
 TRAININGS = {
     "npbg": trained(RASTERS),
-    "point_nerf": trained(POINT_NERF, loss=MASKED, pixel_stride=3),
+    "point_nerf": trained(POINT_NERF, loss=point_nerf.MASKED, pixel_stride=3),
     "points2nerf": trained(HYPER, loss=points2nerf.SQUARES, optimizer=RADAM, pixel_stride=4),
 }
 
@@ -109,7 +108,7 @@ def test_an_object_without_points_has_a_finite_code():
         (lambda: PointNeRFConfig(jitter=1.5), "jitter.*a share"),
         (lambda: dataclasses.replace(npbg.npbg_tiny(), loss=LossConfig()), r"adversarial_weight 1\.0.*use 0"),
         (lambda: dataclasses.replace(npbg.npbg_tiny(), pixel_stride=4), "pixel_stride 4 needs"),
-        (lambda: trained(PointNeRFConfig(), pixel_stride=7, loss=MASKED), "pixel_stride 7 needs"),
+        (lambda: trained(PointNeRFConfig(), pixel_stride=7, loss=point_nerf.MASKED), "pixel_stride 7 needs"),
     ],
 )
 def test_what_the_network_cannot_have_names_the_field_and_what_is_possible(make, hint):
@@ -211,17 +210,11 @@ def test_halving_averages_squares_and_an_odd_side_is_resized_first():
 # --- Point-NeRF -------------------------------------------------------------------------------------------------------
 
 CONFIG = POINT_NERF
-MODULE = PointNeRF(CONFIG)
 
 
 @pytest.fixture(scope="module")
 def variables():
-    return wobbled(jax.jit(MODULE.init)(jax.random.key(0), cloud(), camera()), 4)
-
-
-@jax.jit
-def whole(variables, cloud, camera):
-    return MODULE.apply(variables, cloud, camera)
+    return wobbled(jax.jit(PointNeRF(CONFIG).init)(jax.random.key(0), cloud(), camera()), 4)
 
 
 def waves(x, frequencies):
@@ -300,10 +293,10 @@ def test_the_picture_is_that_of_the_plain_loops(variables, monkeypatch):
 
 def test_without_a_point_in_reach_the_picture_is_exactly_white_and_empty(variables):
     empty = dataclasses.replace(cloud(), mask=jnp.zeros((2, NUM_POINTS), bool))
-    rendering = whole(variables, empty, camera())
+    rendering = tiny_model.render(variables, empty, camera(), config=CONFIG)
     assert (rendering.image == 1).all()
     assert (rendering.acc == 0).all()
-    away = whole(variables, cloud(), camera(target=5.0))
+    away = tiny_model.render(variables, cloud(), camera(target=5.0), config=CONFIG)
     missed = np.asarray(away.acc == 0)
     assert missed.any()
     assert (np.asarray(away.image)[missed] == 1).all()

@@ -26,7 +26,7 @@ from experiments.packaged import demo
 from experiments.paper import fig2, fig3, table1
 from experiments.speed import bench
 from experiments.studies import inverse, relighting, sharpness
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.method import surfel_method
@@ -47,12 +47,11 @@ CLOCKED = {"ms_per_view", "training_seconds", "load", "date", "seconds", "costs"
 
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch):
-    """Networks and surfaces shrunken, no cache on disk."""
+    """Networks and surfaces shrunken."""
     for name, shrunken in (SHRUNKEN | {"tiny": L1_ONLY}).items():
         monkeypatch.setitem(presets.PRESETS, name, lambda shrunken=shrunken: shrunken)
     for name, surface in poisson.SURFACES.items():  # depth 12 takes seconds for a ball of few points
         monkeypatch.setitem(poisson.SURFACES, name, dataclasses.replace(surface, depth=5))
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(sharpness, "KNOWN_SIZE", 48)
     monkeypatch.setattr(fig3, "all_methods", lambda _: {"Ours": contenders.Method(draw=draw_grey)})
     monkeypatch.setattr(weights, "packaged_file", tiny_surfels.shipped)

@@ -17,7 +17,7 @@ from experiments.studies import inverse, relighting
 from experiments.studies.speed_accuracy import front
 from spnr_jax import config, presets
 from spnr_jax.formats import data_sets
-from spnr_jax.kernels.imaging import srgb_to_linear
+from spnr_jax.kernels.imaging import linear_to_srgb, srgb_to_linear
 from spnr_jax.scoring.evaluation import Pictures
 from spnr_jax.surfels import lighting
 from spnr_jax.surfels.sides import spiral
@@ -50,8 +50,7 @@ def test_the_nearest_views_look_from_the_same_side():
 def test_the_log_error_of_a_picture_that_is_right_and_of_one_half_as_bright():
     item = tiny_dataset.one_object()
     white = data_sets.on_white(item.images)
-    half = srgb_to_linear(white) / 2
-    dim = np.where(half <= 0.0031308, 12.92 * half, 1.055 * half ** (1 / 2.4) - 0.055)
+    dim = linear_to_srgb(srgb_to_linear(white) / 2)
     for image, expected in ((white, 0), (dim, np.log(2))):
         found = relighting.log_errors(item, Pictures(image=image, acc=image[..., 0]))
         assert found == pytest.approx([expected] * tiny_dataset.VIEWS, abs=1e-3)

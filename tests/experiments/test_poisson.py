@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.handmade import RED, ball, plain
+from support.handmade import RED, ball, enclosed_volume, plain
 from support.surfel_clouds import cloud
 
 from data_gen.render import light, views
@@ -113,8 +113,7 @@ def test_a_sphere_of_points_is_a_closed_sphere_that_faces_outwards_in_the_colour
     edges = np.sort(part.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # watertight
     assert np.abs(np.linalg.norm(part.positions, axis=1) - RADIUS).max() < 0.03 * RADIUS
-    a, b, c = np.moveaxis(part.positions[part.faces], 1, 0)
-    volume = np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6
+    volume = enclosed_volume(part.positions, part.faces)
     assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)  # and positive: faces turn outwards
     assert (part.normals * part.positions).sum(1).min() > 0.9 * RADIUS
     nearest = np.linalg.norm(part.positions[:, None] - np.asarray(sphere.positions)[None], axis=-1).argmin(1)

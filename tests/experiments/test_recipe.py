@@ -8,7 +8,7 @@ import pytest
 from support import tiny_surfels
 
 from experiments.packaged import recipe
-from spnr_jax import cli, presets
+from spnr_jax import presets
 from spnr_jax.training.weights import load, packaged_file, read_trained, read_variables
 
 pytestmark = pytest.mark.slow
@@ -16,7 +16,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch):
-    monkeypatch.setattr(cli, "set_up_jax", lambda **_: None)
     monkeypatch.setattr(presets, "surfels", lambda: tiny_surfels.CONFIG)
     monkeypatch.setattr(recipe, "STEPS", 2)
     monkeypatch.setattr(recipe, "DENSIFIER_STEPS", 2)

@@ -4,6 +4,7 @@ import numpy as np
 
 from spnr_jax.formats.assets import Asset, Material, Part
 
+WHITE_LIGHT = np.ones((8, 16, 3), np.float32)  # from everywhere
 RED, GREEN, BLUE, GREY = (0.7, 0.05, 0.05), (0.05, 0.6, 0.05), (0.05, 0.05, 0.7), (0.5, 0.5, 0.5)
 
 
@@ -47,6 +48,12 @@ def ball(centre=(0, 0, 0), radius=0.5, material=None, rows=12) -> Part:
     return Part(
         positions=normals * radius + centre, faces=faces.astype(np.int64), material=material or plain(), normals=normals
     )
+
+
+def enclosed_volume(positions, faces) -> float:
+    """Volume within a closed surface whose faces are counter-clockwise from outside."""
+    a, b, c = np.asarray(positions)[faces.T]
+    return np.einsum("fk,fk->", a, np.cross(b, c)) / 6
 
 
 def checked_box_and_ball() -> Asset:

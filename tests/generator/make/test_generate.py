@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.command_line import spnr_data
+from support.folders import contents
 from support.handmade import ball, box
 
 from data_gen.make import objects
@@ -21,11 +22,6 @@ from spnr_jax.surfels.lighting import texel_directions
 VIEWS = 6
 SMALL = ["--resolution", 32, "--views", VIEWS, "--points", 64, "--spp", 16, "--visibility-grid", 2]
 SMALL += ["--lights", "random", "--test-fraction", 0.25]
-
-
-def tree(folder):
-    """Every file of a folder with its bytes."""
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +72,13 @@ def test_a_view_is_brighter_where_the_map_that_is_kept_says_that_its_light_comes
 def test_a_run_with_another_setting_is_refused_in_one_line_and_changes_nothing(
     meshes, finished, generate_here, tmp_path, capsys
 ):
-    before = tree(finished)
+    before = contents(finished)
     for option, value in (("seed", 1), ("spp", 8), ("fov", 30), ("objects", 1)):
         assert generate_here(finished, "--meshes", meshes, *SMALL, f"--{option}", value) == 2
         message = capsys.readouterr().err
         assert message.count("\n") == 1
         assert f"{option} " in message
-    assert tree(finished) == before
+    assert contents(finished) == before
     (tmp_path / "thesis.txt").write_text("years of work")
     assert generate_here(tmp_path, "--objects", 1, *SMALL) == 2
     assert "holds no data set" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from support.command_line import spnr_data
+from support.folders import contents
 
 from data_gen.store import check, layout
 
@@ -24,18 +25,13 @@ def options(out):
 
 def make(out, *more):
     assert spnr_data("generate", *options(out), "--variant", "scalar_rgb", *more) == 0
-    return files(out)
+    return contents(out)
 
 
 def start(out, *more):
     """The same as `make` in a process of its own, as a user starts it."""
     command = [sys.executable, "-m", "data_gen", "generate", *options(out), "--variant", "scalar_rgb", *more]
     return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True)
-
-
-def files(folder):
-    """Every file below a folder, with its bytes."""
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def wait_for(out, number, process):
@@ -70,7 +66,7 @@ def by_two_runs_at_once(folder):
     messages = [process.communicate(timeout=120)[1].decode() for process in both]
     assert [process.returncode for process in both] == [0, 0], messages
     assert check.check(folder / "set")
-    return files(folder / "set")
+    return contents(folder / "set")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +74,7 @@ def expected(tmp_path_factory, generate_here):
     """The data set of one undisturbed process."""
     out = tmp_path_factory.mktemp("alone") / "set"
     assert generate_here(*options(out)) == 0
-    return files(out)
+    return contents(out)
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.gltf_files import CORNERS, UV, GltfBuilder
-from support.handmade import box, plain
+from support.handmade import WHITE_LIGHT, box, plain
 
 from data_gen.render import views
 from data_gen.render.variant import mitsuba_module
 from spnr_jax.formats import meshes, surface_points
 from spnr_jax.formats.assets import Asset
 
-WHITE_LIGHT = np.ones((8, 16, 3), np.float32)
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real" / "train"
 EYE = np.array([0.5, 0.4, 2.9])
 STEP = 1 / 255

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.handmade import ball, box
+from support.handmade import WHITE_LIGHT, ball, box
 
 from data_gen.render import views
 from data_gen.render.variant import LLVM, choose_variant
 from spnr_jax.formats import surface_points
 from spnr_jax.formats.assets import Asset
 
-LIGHT = np.ones((8, 16, 3), np.float32)
 CONFIG = views.ViewConfig(resolution=64, views=1)
 WALL_AND_BOX = Asset(parts=(box((0, 0, -0.3), (0.8, 0.5, 0.05)), box((0.2, 0, 0.3), (0.25, 0.2, 0.1))))
 CROWD = Asset(parts=(*WALL_AND_BOX.parts, ball((-0.4, 0.1, 0.2), 0.3, rows=5)))
@@ -41,7 +40,7 @@ def hidden(asset, positions, eye):
 @pytest.mark.parametrize("eye", EYES)
 def test_the_faces_that_primary_rays_hit_are_those_with_a_point_that_sees_the_camera(eye):
     surface = surface_points.sample_surface(CROWD, 20_000, 1)
-    hit = views.visible_faces(views.build_scene(CROWD, LIGHT), views.look_at(eye), CONFIG, 0)
+    hit = views.visible_faces(views.build_scene(CROWD, WHITE_LIGHT), views.look_at(eye), CONFIG, 0)
     sees = ~hidden(CROWD, surface.positions.astype(np.float64), eye)
     seeing, count = np.unique(surface.face[sees], return_counts=True)
     assert set(seeing[count > 2]) <= set(hit)
@@ -58,9 +57,9 @@ import numpy as np
 from data_gen.render import views
 from data_gen.render.variant import mitsuba_module
 mitsuba_module(sys.argv[1])
-from test_visibility import CONFIG, CROWD, EYES, LIGHT, WALL_AND_BOX
-kept = [views.build_scene(WALL_AND_BOX, LIGHT), views.build_scene(CROWD, LIGHT)]
-scene = views.build_scene(CROWD, LIGHT)
+from test_visibility import CONFIG, CROWD, EYES, WALL_AND_BOX, WHITE_LIGHT
+kept = [views.build_scene(WALL_AND_BOX, WHITE_LIGHT), views.build_scene(CROWD, WHITE_LIGHT)]
+scene = views.build_scene(CROWD, WHITE_LIGHT)
 for eye in EYES:
     print(*views.visible_faces(scene, views.look_at(eye), CONFIG, 0))
 image = views.render_view(scene, views.look_at(EYES[0]), CONFIG, 0)

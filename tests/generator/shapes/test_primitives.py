@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.handmade import enclosed_volume
 
 from data_gen.procedural import planes
 from data_gen.shapes import primitives
@@ -27,9 +28,7 @@ CLOSED = {
 
 
 def volume(mesh):
-    """Signed volume enclosed by faces that look outward."""
-    a, b, c = mesh.positions[mesh.faces.T]
-    return np.einsum("fk,fk->", a, np.cross(b, c)) / 6
+    return enclosed_volume(mesh.positions, mesh.faces)
 
 
 def face_area_vectors(positions, faces):

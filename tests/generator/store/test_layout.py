@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.folders import contents
 
 from data_gen.store import check, layout
 from spnr_jax.formats import data_sets
@@ -44,14 +45,9 @@ def test_an_object_reads_back_as_it_was_written(tmp_path):
     assert check.read_details(tmp_path, "made_up").items() >= record.details.items()
 
 
-def content(folder):
-    """Every file below a folder, with its bytes."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_equal_objects_are_equal_bytes_and_each_file_has_its_checksum(tmp_path):
     layout.write_object(tmp_path, "made_up", made_up_record())
-    found = content(tmp_path / "objects" / "made_up")
+    found = contents(tmp_path / "objects" / "made_up")
     assert found == layout.object_files(made_up_record())
     checksums = {name: hashlib.sha256(made).hexdigest() for name, made in found.items() if name != "object.json"}
     assert json.loads(found["object.json"])["files"] == checksums
@@ -80,9 +76,9 @@ def test_an_object_that_fails_half_way_does_not_count_and_is_made_again(tmp_path
 
 def test_a_finished_object_is_not_written_again(tmp_path):
     layout.write_object(tmp_path, "made_up", made_up_record(seed=0))
-    before = content(tmp_path)
+    before = contents(tmp_path)
     layout.write_object(tmp_path, "made_up", made_up_record(seed=1))
-    assert content(tmp_path) == before
+    assert contents(tmp_path) == before
     assert [layout.has_object(tmp_path, name) for name in ("made_up", "other")] == [True, False]
 
 

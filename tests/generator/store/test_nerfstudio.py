@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 
 def read(folder):
-    """Points (n, 3), and per frame the pixels (n, 2) of the points and the alpha (h, w), as in nerfstudio."""
+    """Of each frame the pixels (n, 2) of the points, and the alpha (h, w), as in nerfstudio."""
     points = np.asarray(trimesh.load(folder / "points.ply").vertices)
     meta = json.loads((folder / "transforms.json").read_text())
     assert meta["camera_model"] in ("OPENCV", "PINHOLE")
@@ -44,13 +44,12 @@ def read(folder):
         assert (z < 0).all(), "an object lies before its cameras"
         pixels = np.stack([meta["cx"] + meta["fl_x"] * x / -z, meta["cy"] - meta["fl_y"] * y / -z], axis=1)
         frames.append((pixels, image[..., 3]))
-    return points, frames
+    return frames
 
 
 @pytest.mark.ci  # it starts workers
 def test_the_points_reproject_onto_the_object_and_cover_it(folder):
-    _, frames = read(folder)
-    for pixels, alpha in frames:
+    for pixels, alpha in read(folder):
         column, row = np.floor(pixels).astype(int).T
         assert (alpha[row, column] > 0).mean() > 0.995
         drawn = np.zeros_like(alpha, bool)
