@@ -210,6 +210,13 @@ class Light:
         return Light(tables=(1 - part) * near + part * far)
 
 
+def check_camera_kind(camera: Any) -> None:
+    """ValueError unless it is a camera, or a batch of cameras in one record."""
+    if not isinstance(camera, Camera):
+        kind = type(camera).__name__
+        raise UserError(f"camera: expected a Camera, as of model.camera or cameras.pinhole, got {kind}")
+
+
 def check_light(light: Light | None) -> None:
     """ValueError unless it is one light, or None."""
     if light is not None and not isinstance(light, Light):

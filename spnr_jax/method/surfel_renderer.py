@@ -34,6 +34,7 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
+    check_camera_kind,
     check_light,
     unstack,
 )
@@ -231,6 +232,7 @@ def render(
 def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
     """ValueError in one line if there is not exactly one object, one view and one light."""
     check_light(light)
+    check_camera_kind(camera)
     _check_scene(scene, "render")
     for what, array, wanted in (
         ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
