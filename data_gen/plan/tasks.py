@@ -50,7 +50,7 @@ class GenerateConfig:
     categories: tuple[str, ...] = ()
     """Categories of procedural objects (default: all)."""
     meshes: Path | None = None
-    """Folder of .glb, .gltf, .obj and .ply files."""
+    """Folder of .glb, .gltf, .obj, .ply, .stl and .off files."""
     colour_variants: int = 0
     """Variants of each training object with its base colours rotated in RGB space; test objects have none."""
     reshape_variants: bool = False

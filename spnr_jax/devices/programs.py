@@ -12,9 +12,8 @@ With cached traces (`CachedProgram`), a new process neither traces nor compiles.
 import contextlib
 import functools
 import hashlib
-import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from importlib import resources
 from pathlib import Path
@@ -103,14 +102,11 @@ class CachedProgram:
         self,
         function: Callable[..., Any],
         *,
-        returns: Iterable[type] = (),
         static: str | tuple[str, ...] = (),
         options: dict[str, Any] | None = None,
     ) -> None:
-        """`returns`: classes of the returned records; `static`: static keyword arguments; `options`: XLA's."""
+        """`static`: static keyword arguments; `options`: XLA's."""
         functools.update_wrapper(self, function)
-        for record in returns:
-            _register(record)
         self.function, self.options = function, options
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self.programs: dict[Any, Callable[..., Any]] = {}
@@ -191,18 +187,3 @@ def _digest_sources() -> bytes:
     for path in sorted(root.rglob("*.py")):
         found.update(path.read_bytes())
     return found.digest()
-
-
-@functools.cache  # twice is an error
-def _register(record: type) -> None:
-    """Registers a record with `jax.export`."""
-    name = f"{record.__module__}.{record.__qualname__}"
-    if issubclass(record, tuple):
-        export.register_namedtuple_serialization(record, serialized_name=name)
-    else:
-        export.register_pytree_node_serialization(
-            record,
-            serialized_name=name,
-            serialize_auxdata=lambda fixed: json.dumps(fixed).encode(),
-            deserialize_auxdata=lambda written: tuple(json.loads(bytes(written))),
-        )

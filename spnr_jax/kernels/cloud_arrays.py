@@ -41,6 +41,9 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
 
 def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:
     """ValueError, which names the function and the field, for a field that does not fit the mask (points,)."""
+    if not isinstance(cloud, PointCloud):
+        kind = type(cloud).__name__
+        raise UserError(f"{where}: expected a PointCloud, as of read_cloud or make_cloud, got {kind}")
     shape, kind = np.shape(cloud.mask), getattr(cloud.mask, "dtype", None) or np.asarray(cloud.mask).dtype
     if kind != np.bool_:
         raise UserError(f"{where}: cloud.mask is of type {kind}, expected bool")

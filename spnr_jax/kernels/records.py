@@ -5,11 +5,13 @@ points, rays, samples, height, width, features.  Colours of materials are linear
 sizes are static fields because they shape arrays.
 """
 
+import json
 from typing import Any, no_type_check
 
 import jax
 import numpy as np
 from flax import struct
+from jax import export
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from spnr_jax.errors import UserError
@@ -208,6 +210,13 @@ class Light:
         return Light(tables=(1 - part) * near + part * far)
 
 
+def check_camera_kind(camera: Any) -> None:
+    """ValueError unless it is a camera, or a batch of cameras in one record."""
+    if not isinstance(camera, Camera):
+        kind = type(camera).__name__
+        raise UserError(f"camera: expected a Camera, as of model.camera or cameras.pinhole, got {kind}")
+
+
 def check_light(light: Light | None) -> None:
     """ValueError unless it is one light, or None."""
     if light is not None and not isinstance(light, Light):
@@ -292,6 +301,16 @@ class Gaussians:
     opacity: Float[AnyArray, " splats"]
     harmonics: Float[AnyArray, "splats coefficients 3"]
 
+
+for record in (
+    PointCloud, Camera, Rays, Rendering, Scene, Volume, Surfels, SurfelScene, Light, GBuffer, Batch, Crops, Gaussians
+):  # fmt: skip
+    export.register_pytree_node_serialization(
+        record,
+        serialized_name=f"{record.__module__}.{record.__qualname__}",
+        serialize_auxdata=lambda fixed: json.dumps(fixed, default=int).encode(),  # of NumPy's whole numbers
+        deserialize_auxdata=lambda written: tuple(json.loads(bytes(written))),
+    )
 
 Key = jax.Array
 

@@ -27,6 +27,7 @@ from spnr_jax.kernels.records import (
     Rendering,
     SurfelScene,
     Volume,
+    check_camera_kind,
     check_light,
     unstack,
 )
@@ -91,6 +92,7 @@ class Model:
         The paper's network samples only near the points at `draft`, `balanced` and `best`, with a quarter, half and all
         of its samples per ray.  At `trained` it samples the whole box, as in training.
         """
+        check_camera_kind(camera)
         if camera.cam_to_world.ndim == 2:
             return next(self.render_each(volume, [camera], quality, [light]))
         drawn = self.render_each(volume, unstack(camera), quality, [light] * len(camera.cam_to_world))

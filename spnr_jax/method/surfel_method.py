@@ -20,9 +20,9 @@ from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
-from spnr_jax.kernels.records import Camera, GBuffer, Key, Light, PointCloud, Rendering, Surfels, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Sizes, WindowBuffer
+from spnr_jax.method.surfel_renderer import Sizes
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
@@ -125,14 +125,14 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
     return PlannedView(camera, light or room_light(), (doublings, side), needed)
 
 
-@partial(CachedProgram, returns=(SurfelScene, Surfels), options=QUICKEST)
+@partial(CachedProgram, options=QUICKEST)
 def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScene:
     return make_scene(cloud, neighbors, jnp.zeros(3), jnp.ones(()))
 
 
-_densify = CachedProgram(densifier.densify_in_box, returns=(PointCloud,), options=QUICKEST)
-_rasterize = CachedProgram(surfel_renderer.rasterize_window, static="plan", returns=(WindowBuffer, GBuffer))
-_shade = CachedProgram(surfel_renderer.shade_window, static="plan", returns=(Rendering,), options=QUICKEST)
+_densify = CachedProgram(densifier.densify_in_box, options=QUICKEST)
+_rasterize = CachedProgram(surfel_renderer.rasterize_window, static="plan")
+_shade = CachedProgram(surfel_renderer.shade_window, static="plan", options=QUICKEST)
 _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.devices.programs import CachedProgram
@@ -33,6 +34,7 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
+    check_camera_kind,
     check_light,
     unstack,
 )
@@ -75,6 +77,9 @@ class Sizes(NamedTuple):
     height: Any
     entries: Any
     slots: Any
+
+
+export.register_namedtuple_serialization(Sizes, serialized_name=f"{__name__}.Sizes")
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
@@ -132,7 +137,7 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
     return doublings, 2 if pixels < finest else 1
 
 
-@partial(CachedProgram, static=("doublings", "side"), returns=(Sizes,))
+@partial(CachedProgram, static=("doublings", "side"))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
     whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), doublings, side)
@@ -227,6 +232,7 @@ def render(
 def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
     """ValueError in one line if there is not exactly one object, one view and one light."""
     check_light(light)
+    check_camera_kind(camera)
     _check_scene(scene, "render")
     for what, array, wanted in (
         ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
@@ -258,6 +264,9 @@ class WindowBuffer(NamedTuple):
     buffer: GBuffer
     corner: Int[Array, "2"]
     overflow: Int[Array, ""]
+
+
+export.register_namedtuple_serialization(WindowBuffer, serialized_name=f"{__name__}.WindowBuffer")
 
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:

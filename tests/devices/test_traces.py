@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from support.laws import close
 
 from spnr_jax.devices import programs
-from spnr_jax.kernels.records import Rays
+from spnr_jax.kernels.records import TABLES, Camera, Light, Rays, Volume
 
 CALLS = []
 
@@ -32,7 +33,7 @@ def folder(tmp_path):
 
 def kept():
     """As a new process has it."""
-    return programs.CachedProgram(bend, returns=(Rays,), static="times")
+    return programs.CachedProgram(bend, static="times")
 
 
 RAYS = Rays(np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), np.float32))
@@ -96,3 +97,11 @@ def test_programs_are_dropped_before_the_memory_maps_of_the_process_run_out(fold
     monkeypatch.setattr(programs, "MAPS", folder / "absent")  # as on other systems
     programs.make_room()
     assert cleared == []
+
+
+def test_jax_export_writes_and_reads_functions_of_records():
+    """Their static fields too, as whole numbers of NumPy."""
+    camera = Camera(np.zeros((3, 4), np.float32), np.eye(3, dtype=np.float32), height=np.int64(4), width=6)
+    scene = Volume(scene=Light(np.zeros(TABLES, np.float32)), centre=SHIFT, scale=SHIFT[0])
+    content = export.export(jax.jit(lambda *of: of))(camera, scene).serialize()
+    close(export.deserialize(content).call(camera, scene), (camera, scene))

@@ -61,6 +61,10 @@ CALLS = {
     "spnr_jax.metrics.psnr(rows[0], rows[0, :1])": "psnr: expected two arrays of the same shape, got (9, 3) and (1, 3)",
     "spnr_jax.metrics.conditional_psnr(rows, rows, rows[0] > 0)": "conditional_psnr: expected a mask (4, 9), got",
     "spnr_jax.losses.l1(rows, rows[0])": "l1: expected two arrays of the same shape, got (4, 9, 3) and (9, 3)",
+    "neighbors('chair.ply')": "neighbors: expected a PointCloud, as of read_cloud or make_cloud, got str",
+    "encode(None, rows[0], near)": "encode: expected a PointCloud, as of read_cloud or make_cloud, got ndarray",
+    "render(None, scene, rows[0, :3], plan=None)": "camera: expected a Camera, as of model.camera or cameras.pinhole",
+    "model.render(volume, [camera])": "camera: expected a Camera, as of model.camera or cameras.pinhole, got list",
     "spnr_jax.losses.mse(cloud.mask, cloud.mask)": "mse: expected floats in [0, 1], got bool and bool",
 }
 SCRIPT = """
@@ -80,7 +84,7 @@ for call in json.loads(sys.argv[1]):
     try:
         eval(call)
         said.append("nothing")
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         said.append(str(error))
 print(json.dumps(said))
 """
