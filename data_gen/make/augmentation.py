@@ -84,7 +84,7 @@ ROUNDING = 1e-6  # of a rotated float32 colour; what it exceeds the gamut by is 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColourRotation:
+class ColorRotation:
     """A rotation (3, 3) about the grey axis, its angle, and how it was found."""
 
     matrix: np.ndarray
@@ -97,18 +97,18 @@ class ColourRotation:
         return {**vars(self), "matrix": self.matrix.tolist()}
 
 
-def rotate_colours(asset: Asset, seed: int) -> tuple[Asset, ColourRotation]:
+def rotate_colors(asset: Asset, seed: int) -> tuple[Asset, ColorRotation]:
     """The asset with its base colours rotated, and the rotation, a function of the colours and the seed."""
-    rotation = draw_rotation(base_colours(asset), seed)
+    rotation = draw_rotation(base_colors(asset), seed)
     return replace(asset, parts=tuple(rotate_part(part, rotation.matrix) for part in asset.parts)), rotation
 
 
-def base_colours(asset: Asset) -> np.ndarray:
+def base_colors(asset: Asset) -> np.ndarray:
     """Every base colour (n, 3) of the asset: flat ones, at vertices, and all texels."""
-    return np.concatenate([part_colours(part).reshape(-1, 3) for part in asset.parts])
+    return np.concatenate([part_colors(part).reshape(-1, 3) for part in asset.parts])
 
 
-def part_colours(part: Part) -> np.ndarray:
+def part_colors(part: Part) -> np.ndarray:
     """The base colours (3,), (v, 3) or (height, width, 3) of a part, vertex colours times the material's."""
     if part.colors is None:
         return part.material.base_color
@@ -116,17 +116,17 @@ def part_colours(part: Part) -> np.ndarray:
     return part.colors * part.material.base_color
 
 
-def draw_rotation(colours: np.ndarray, seed: int) -> ColourRotation:
+def draw_rotation(colours: np.ndarray, seed: int) -> ColorRotation:
     """A random rotation about the grey axis that keeps the colours (n, 3) in the gamut."""
     rng = np.random.default_rng(seed)
-    extreme = extreme_colours(colours)  # nearly every draw that fails, fails for one of these few
+    extreme = extreme_colors(colours)  # nearly every draw that fails, fails for one of these few
     for draw in range(1, MAX_DRAWS + 1):
         degrees = rng.uniform(LEAST_DEGREES, 360 - LEAST_DEGREES)
         matrix = grey_rotation(degrees)
         if in_gamut(extreme, matrix) and in_gamut(colours, matrix):
-            return ColourRotation(matrix=matrix, degrees=degrees, draws=draw, fallback=False)
+            return ColorRotation(matrix=matrix, degrees=degrees, draws=draw, fallback=False)
     degrees = float(rng.choice([120, 240]))
-    return ColourRotation(matrix=grey_rotation(degrees), degrees=degrees, draws=MAX_DRAWS, fallback=True)
+    return ColorRotation(matrix=grey_rotation(degrees), degrees=degrees, draws=MAX_DRAWS, fallback=True)
 
 
 def grey_rotation(degrees: float) -> np.ndarray:
@@ -137,7 +137,7 @@ def grey_rotation(degrees: float) -> np.ndarray:
     return np.cos(angle) * (np.eye(3) - along) + np.sin(angle) * across + along
 
 
-def extreme_colours(colours: np.ndarray) -> np.ndarray:
+def extreme_colors(colours: np.ndarray) -> np.ndarray:
     """The colours (m, 3) that some rotation of a coarse grid takes furthest up or down in a channel."""
     rows = np.stack([grey_rotation(degrees)[0] for degrees in np.linspace(0, 360, TURNS, endpoint=False)])
     first = [
@@ -154,7 +154,7 @@ def in_gamut(colours: np.ndarray, matrix: np.ndarray) -> bool:
 
 def rotate_part(part: Part, matrix: np.ndarray) -> Part:
     """The part with its base colours rotated; vertex colours take up the colour that they multiplied."""
-    rotated = np.clip(part_colours(part) @ matrix.T, 0, 1)
+    rotated = np.clip(part_colors(part) @ matrix.T, 0, 1)
     if part.colors is None:
         return replace(part, material=replace(part.material, base_color=rotated.astype(np.float32)))
     return replace(part, colors=rotated, material=replace(part.material, base_color=np.ones(3, np.float32)))

@@ -73,7 +73,7 @@ def make_asset(task: Task, seed: int) -> tuple[Asset, dict]:
     asset, seeds = load_asset(task, seed), object_seeds(seed, task.object_id)
     details: dict = {"colour_rotation": None}
     if task.colour_variant:
-        asset, rotation = augmentation.rotate_colours(asset, seeds["colours"])
+        asset, rotation = augmentation.rotate_colors(asset, seeds["colours"])
         details["colour_rotation"] = rotation.describe()
     if task.reshaped:
         shape = augmentation.draw_reshaping(seeds["pose"])

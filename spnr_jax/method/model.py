@@ -129,6 +129,9 @@ class Model:
 
         Pure: angles and volume may be traced.
         """
+        if not isinstance(volume, Volume | SurfelScene):
+            kind = type(volume).__name__
+            raise UserError(f"camera: expected what Model.encode or spnr_jax.encode returns, got {kind}")
         size = self.config.image_resolution if resolution is None else resolution
         if not isinstance(size, int | np.integer) or size < 1:
             raise UserError(f"camera: resolution={size} is no number of pixels; `cameras.resize` makes other shapes")

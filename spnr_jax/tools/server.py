@@ -162,7 +162,8 @@ TITLE = "{}: {:,} points"
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 WIDEST_EXPOSURE = 4.0  # stops
-PREPARING = "The network is being prepared."
+PATIENCE = 1.0  # seconds of drawing after which the page says why it waits
+PREPARING = "Drawing. For a picture of a new size, programs are compiled first, once."
 ONE_LIGHT = "This network knows the light of its training alone; `--run surfels` draws in any."
 
 
@@ -198,12 +199,17 @@ class Browser:
             self._replace(view=view)
 
     def _draw(self, state: State, moving: bool) -> None:
-        with self._network:
-            canvas = frame.draw(self._model, state, moving)
+        waiting = threading.Timer(PATIENCE, lambda: setattr(self._status, "content", PREPARING))
+        waiting.start()
+        try:
+            with self._network:
+                canvas = frame.draw(self._model, state, moving)
+        finally:
+            waiting.cancel()
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
-            self._status.content = self._status.content.replace(PREPARING, "")
+            self._status.content = ""
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))

@@ -40,8 +40,8 @@ ASSETS = st.builds(
 @SLOW
 @given(ASSETS, SEEDS)
 def test_colours_are_rotated_within_the_gamut_everywhere_and_nothing_else_changes(asset, seed):
-    rotated, rotation = augmentation.rotate_colours(asset, seed)
-    before, after = augmentation.base_colours(asset), augmentation.base_colours(rotated)
+    rotated, rotation = augmentation.rotate_colors(asset, seed)
+    before, after = augmentation.base_colors(asset), augmentation.base_colors(rotated)
     assert 0 <= after.min() <= after.max() <= 1
     np.testing.assert_allclose(distances(after), distances(before), atol=1e-5)
     before, after = (sample_surface(shape, 200, 3) for shape in (asset, rotated))
@@ -61,7 +61,7 @@ def test_it_is_a_rotation_that_keeps_greys(degrees):
 
 def test_colours_that_leave_no_room_are_permuted_and_the_object_says_so():
     asset = Asset(parts=(ball(material=plain((1, 0, 0))), box(material=plain((0, 1, 1)))))
-    rotated, rotation = augmentation.rotate_colours(asset, 0)
+    rotated, rotation = augmentation.rotate_colors(asset, 0)
     assert rotation.describe()["fallback"]
     assert rotation.degrees in (120, 240)
     assert {tuple(part.material.base_color.round(6)) for part in rotated.parts} in (
@@ -72,10 +72,10 @@ def test_colours_that_leave_no_room_are_permuted_and_the_object_says_so():
 
 def test_muted_colours_turn_any_way_and_the_seed_decides_which():
     asset = Asset(parts=(ball(material=plain((0.5, 0.4, 0.45))),))
-    turns = [augmentation.rotate_colours(asset, seed)[1] for seed in range(200)]
+    turns = [augmentation.rotate_colors(asset, seed)[1] for seed in range(200)]
     assert not any(turn.fallback for turn in turns)
     assert np.histogram([turn.degrees for turn in turns], 6, (30, 330))[0].min() > 15
-    assert turns[7].describe() == augmentation.rotate_colours(asset, 7)[1].describe()
+    assert turns[7].describe() == augmentation.rotate_colors(asset, 7)[1].describe()
 
 
 def test_a_rare_saturated_texel_is_not_overlooked():
