@@ -236,7 +236,9 @@ def _eliminate(matrix: Array, right: Array) -> Array:
     return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
 
 
-def dot(one: Float[Array, "3 ..."] | Sequence[Array], two: Float[Array, "3 ..."] | Sequence[Array]) -> Array:
+def dot(
+    one: Float[Array | np.ndarray, "3 ..."] | Sequence[Array], two: Float[Array | np.ndarray, "3 ..."] | Sequence[Array]
+) -> Array:
     """Scalar products of vectors, given as arrays (3, ...) or as their three components."""
     return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
 from spnr_jax.kernels.numerics import (
     clamp,
+    dot,
     larger,
     normalize,
     one_minus_exp,
@@ -82,9 +83,9 @@ def compute_inputs(
     confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
     color = clamp(blended + confidence * clamp(buffer.color - blended, -SHARPEST, SHARPEST), 0, 1)
     normal, view = _directions(buffer, camera)
-    cosine = -reduce(add, (n * v for n, v in zip(normal, view, strict=True)))
+    cosine = -dot(normal, view)
     mirror = [v + 2 * cosine * n for n, v in zip(normal, view, strict=True)]
-    world = [_to_world(camera, direction) for direction in (normal, mirror)]
+    world = [[dot(row, direction) for row in camera.cam_to_world[:, :3]] for direction in (normal, mirror)]
     factor, summand = lighting.reflectance(roughness, clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
@@ -115,12 +116,6 @@ def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Arra
     up = jnp.broadcast_to(-((down - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
     length = jnp.sqrt(right**2 + up**2 + 1)
     return normal, [right / length, up / length, -1 / length]
-
-
-def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
-    pose = camera.cam_to_world
-    x, y, z = direction
-    return [pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z for i in range(3)]
 
 
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:
