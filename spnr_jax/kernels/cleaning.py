@@ -113,7 +113,7 @@ def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, stre
     if averages:
         before = len(positions)
         positions, values = denoise(positions, values, sigma, spacing)
-        kept = ~find_fringe(positions, choose_fringe_cell(sigma, spacing))
+        kept = ~find_fringe(positions, max(CELL[0] * sigma, CELL[1] * spacing))
         positions, values = positions[kept], {name: x[kept] for name, x in values.items()}
         lines.append(f"averaged {before:,} points to {len(positions):,}: noise of {sigma / spacing:.1f} spacings")
     return Cleaned(positions, values, lines, sigma if averages else 0.0)
@@ -298,11 +298,6 @@ def _find_local_axes(
     offset = (offset - mean[:, None]) * np.sqrt(weights)[..., None]
     squared, axes = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
     return np.einsum("nij,ni->nj", axes, mean), squared, axes
-
-
-def choose_fringe_cell(sigma: float, spacing: float) -> float:
-    """Side of the voxels for `find_fringe`, from the noise and the spacing."""
-    return max(CELL[0] * sigma, CELL[1] * spacing)
 
 
 def find_fringe(positions: Float[np.ndarray, "points 3"], side: float) -> Bool[np.ndarray, " points"]:

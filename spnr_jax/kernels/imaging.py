@@ -6,6 +6,7 @@ gradients are finite at 0 and below.
 """
 
 import dataclasses
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -53,16 +54,12 @@ def resize_bilinear(
 def double_size(x: Float[Array, "batch height width features"]) -> Float[Array, "batch h w features"]:
     """Twice the size, bilinear; the border repeats."""
     for axis in (1, 2):
-        size = x.shape[axis]
-        before = jnp.concatenate([_slice(x, axis, 0, 1), _slice(x, axis, 0, size - 1)], axis)
-        after = jnp.concatenate([_slice(x, axis, 1, size), _slice(x, axis, size - 1, size)], axis)
+        size, part = x.shape[axis], partial(jax.lax.slice_in_dim, x, axis=axis)
+        before = jnp.concatenate([part(0, 1), part(0, size - 1)], axis)
+        after = jnp.concatenate([part(1, size), part(size - 1, size)], axis)
         pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
         x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
     return x
-
-
-def _slice(x: Array, axis: int, first: int, end: int) -> Array:
-    return jax.lax.slice_in_dim(x, first, end, axis=axis)
 
 
 def average_pool(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:

@@ -5,7 +5,7 @@ instead: every step is one pass over all points of a block, which a CPU vectoris
 take ten times as long.  XLA flushes subnormal numbers (below 1.2e-38) to zero.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from operator import add
 from types import ModuleType
@@ -236,13 +236,17 @@ def _eliminate(matrix: Array, right: Array) -> Array:
     return jax.lax.fori_loop(0, len(matrix), eliminate, rows)[:, len(matrix) :]
 
 
-def dot(one: Float[Array, "3 ..."], two: Float[Array, "3 ..."]) -> Float[Array, "..."]:
-    """Scalar products."""
+def dot(
+    one: Float[Array | np.ndarray, "3 ..."] | Sequence[Array], two: Float[Array | np.ndarray, "3 ..."] | Sequence[Array]
+) -> Array:
+    """Scalar products of vectors, given as arrays (3, ...) or as their three components."""
     return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 
 
-def cross(one: Float[Array, "3 points"], two: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
-    """Vector products."""
+def cross(
+    one: Float[Array, "3 points"] | Sequence[Array], two: Float[Array, "3 points"] | Sequence[Array]
+) -> Float[Array, "3 points"]:
+    """Vector products, likewise."""
     return jnp.stack([one[i - 2] * two[i - 1] - one[i - 1] * two[i - 2] for i in range(3)])
 
 

@@ -5,7 +5,6 @@ points, rays, samples, height, width, features.  Colours of materials are linear
 sizes are static fields because they shape arrays.
 """
 
-import json
 from typing import Any, no_type_check
 
 import jax
@@ -302,14 +301,15 @@ class Gaussians:
     harmonics: Float[AnyArray, "splats coefficients 3"]
 
 
+# `jax.export` then writes functions of them; static fields are whole numbers
 for record in (
     PointCloud, Camera, Rays, Rendering, Scene, Volume, Surfels, SurfelScene, Light, GBuffer, Batch, Crops, Gaussians
 ):  # fmt: skip
     export.register_pytree_node_serialization(
         record,
         serialized_name=f"{record.__module__}.{record.__qualname__}",
-        serialize_auxdata=lambda fixed: json.dumps(fixed, default=int).encode(),  # of NumPy's whole numbers
-        deserialize_auxdata=lambda written: tuple(json.loads(bytes(written))),
+        serialize_auxdata=lambda sizes: " ".join(map(str, sizes)).encode(),
+        deserialize_auxdata=lambda written: tuple(map(int, bytes(written).split())),
     )
 
 Key = jax.Array

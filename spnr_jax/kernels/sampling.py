@@ -6,6 +6,8 @@ Vocabulary: `edges` (*batch, n+1) are the sorted ends of n bins along a ray, `di
 than a coarse bin.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped
@@ -103,17 +105,13 @@ def count_at_most(
     sorted_values: Shaped[Array, "*batch n"], queries: Shaped[Array, "*batch m"], strictly: bool = False
 ) -> Int[Array, "*batch m"]:
     """Number of sorted values <= (strictly: <) each query; by comparing all for few values, else by bisection."""
-    n = sorted_values.shape[-1]
+    if sorted_values.shape[-1] > 256:
+        bisect = partial(jnp.searchsorted, side="left" if strictly else "right")
+        return jnp.vectorize(bisect, signature="(n),(m)->(m)")(sorted_values, queries)
     count = jnp.zeros(queries.shape, jnp.int32)
-    if n <= 256:
-        for i in range(n):
-            value = sorted_values[..., i : i + 1]
-            count = count + (value < queries if strictly else value <= queries)
-        return count
-    for step in (2**k for k in reversed(range(n.bit_length()))):
-        value = _pick(sorted_values, jnp.minimum(count + step, n) - 1)
-        passes = value < queries if strictly else value <= queries
-        count = jnp.where((count + step <= n) & passes, count + step, count)
+    for i in range(sorted_values.shape[-1]):
+        value = sorted_values[..., i : i + 1]
+        count = count + (value < queries if strictly else value <= queries)
     return count
 
 

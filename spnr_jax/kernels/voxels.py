@@ -99,20 +99,16 @@ def _gather_bwd(residuals, cotangent):
 gather_rows.defvjp(_gather_fwd, _gather_bwd)
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
 def scatter_rows(
     index: Int[Array, "*batch"], values: Float[Array, "*batch features"], rows: int
 ) -> Float[Array, "rows features"]:
     """Table whose row r is the sum of the values with index r; every index must be in [0, rows)."""
-    return _scatter_rows(rows, index, values)
-
-
-def _scatter_zeros(rows, index, values):
     return _scatter(jnp.zeros((rows, values.shape[-1]), values.dtype), index, values)
 
 
-_scatter_rows = jax.custom_vjp(_scatter_zeros, nondiff_argnums=(0,))
-_scatter_rows.defvjp(
-    lambda rows, index, values: (_scatter_rows(rows, index, values), index),
+scatter_rows.defvjp(
+    lambda index, values, rows: (scatter_rows(index, values, rows), index),
     lambda rows, index, cotangent: (np.zeros(index.shape, jax.dtypes.float0), gather_rows(cotangent, index)),
 )
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
-from spnr_jax.kernels.records import AnyArray, Key, PointCloud, Surfels
+from spnr_jax.kernels.records import AnyArray, Key, PointCloud
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, measure_evenness, normalise_cloud
 
@@ -87,18 +87,11 @@ class LearnedPoints(NamedTuple):
 
 def build_graph(cloud: PointCloud, neighbors: Int[Array, "n 20"]) -> tuple[Nodes, Candidates]:
     """Graph nodes and candidates of a cloud in the box: the inputs of the network."""
-    nodes = describe_nodes(estimate_surfels(cloud, neighbors))
-    return nodes, place_candidates(nodes, neighbors)
-
-
-def describe_nodes(surfels: Surfels) -> Nodes:
-    """Node features from the surfels of a cloud."""
-    position, normal, spacing, color = map(
-        jnp.asarray, (surfels.position, surfels.normal, surfels.spacing, surfels.base_color)
-    )
-    openness, shown = 2 * jnp.mean(surfels.visibility, axis=1), jnp.asarray(surfels.mask, spacing.dtype)
+    surfels = jax.tree.map(jnp.asarray, estimate_surfels(cloud, neighbors))
+    openness, shown = 2 * jnp.mean(surfels.visibility, axis=1), surfels.mask.astype(surfels.spacing.dtype)
     traits = jnp.concatenate([surfels.shape_ratios, jnp.stack([surfels.one_sided, openness, shown], axis=1)], axis=1)
-    return Nodes(position, normal, spacing, safe_sqrt(color), traits)
+    nodes = Nodes(surfels.position, surfels.normal, surfels.spacing, safe_sqrt(surfels.base_color), traits)
+    return nodes, place_candidates(nodes, neighbors)
 
 
 class Pairs(NamedTuple):

@@ -109,7 +109,8 @@ class Model:
 
         The surfel network uses common array sizes for all frames, so that it is compiled once.
         """
-        _check_quality(quality)
+        if quality not in get_args(Quality):
+            raise UserError(f"quality must be one of {', '.join(get_args(Quality))}, got {quality}")
         if not isinstance(volume, Volume):
             raise UserError(f"render: expected a volume of Model.encode, got {type(volume).__name__}")
         lights = lights or [None] * len(views)
@@ -168,8 +169,3 @@ def _orbit(azimuth, elevation, centre, scale, *, size: int) -> Camera:
     """Square camera of `size` pixels that looks at the centre; angles in degrees."""
     turn, rise = (jnp.deg2rad(jnp.asarray(angle, jnp.float32)) for angle in (azimuth, elevation))
     return cameras.pinhole(cameras.orbit(turn, rise, DISTANCE / scale, centre), FIELD_OF_VIEW, size, size)
-
-
-def _check_quality(quality: str) -> None:
-    if quality not in get_args(Quality):
-        raise UserError(f"quality must be one of {', '.join(get_args(Quality))}, got {quality}")

@@ -140,21 +140,12 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 @partial(CachedProgram, static=("doublings", "side"))
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
-    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), doublings, side)
+    whole = scale_camera(scene, camera, doublings, side)
     corner, width, height = place_window(scene.surfels, whole)
-    window = crop_camera(whole, corner, width, height)
-    foot = splatting.project_discs(scene.surfels, window)
-    return Sizes(
-        width,
-        height,
-        splatting.count_entries(foot.covered),
-        splatting.bound_covered_pixels(foot, _largest_window(whole)),
-    )
-
-
-def _largest_window(camera: Camera) -> tuple[int, int]:
-    """Largest rows and columns of a window: it begins inside the picture and may extend beyond it."""
-    return camera.height + MARGIN + STEP, camera.width + MARGIN + STEP
+    foot = splatting.project_discs(scene.surfels, crop_camera(whole, corner, width, height))
+    largest = whole.height + MARGIN + STEP, whole.width + MARGIN + STEP  # a window may extend beyond the picture
+    slots = splatting.bound_covered_pixels(foot, largest)
+    return Sizes(width, height, splatting.count_entries(foot.covered), slots)
 
 
 def max_sizes(needed: Iterable[Sizes]) -> Sizes:
@@ -164,24 +155,22 @@ def max_sizes(needed: Iterable[Sizes]) -> Sizes:
 
 def round_sizes(sizes: Sizes, doublings: int, side: int) -> Plan:
     """The plan that holds these sizes; counts are rounded up to powers of the root of two, so that few are compiled."""
-    entries, slots = (
-        _round_count(*x)
-        for x in ((sizes.entries, LEAST_ENTRIES, MOST_ENTRIES), (sizes.slots, LEAST_SLOTS, MOST_ENTRIES))
-    )
+    entries, slots = _round_count(sizes.entries, LEAST_ENTRIES), _round_count(sizes.slots, LEAST_SLOTS)
     return Plan(doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
 
 
-def _round_count(count: int, least: int, most: int) -> int:
-    if count > most:
+def _round_count(count: int, least: int) -> int:
+    if count > (most := MOST_ENTRIES):
         raise UserError(f"the picture needs {count} entries of discs, at most {most} are drawn; ask for a smaller one")
     return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
 
 
-def scale_camera(camera: Camera, doublings: int, side: int) -> Camera:
-    """The camera at the G-buffer's resolution; the doubled picture may exceed the image, and is then cropped."""
+def scale_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) -> Camera:
+    """The camera in the box at the G-buffer's resolution; the doubled picture may exceed the image: it is cropped."""
     height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
     scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
-    return dataclasses.replace(camera, intrinsics=camera.intrinsics * scale, height=height, width=width)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
+    return dataclasses.replace(inside, intrinsics=camera.intrinsics * scale, height=height, width=width)
 
 
 def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
@@ -271,7 +260,7 @@ export.register_namedtuple_serialization(WindowBuffer, serialized_name=f"{__name
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
-    whole = scale_camera(cameras.move_into_box(camera, scene.centre, scene.scale), plan.doublings, plan.side)
+    whole = scale_camera(scene, camera, plan.doublings, plan.side)
     corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
     window = crop_camera(whole, corner, plan.width, plan.height)
     buffer, overflow = rasterize(scene.surfels, window, light, capacity=plan.entries, slots=plan.slots)
@@ -289,9 +278,10 @@ def shade_window(
     plan: Plan,
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
-    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
-    window = crop_camera(scale_camera(inside, plan.doublings, plan.side), window_buffer.corner, plan.width, plan.height)
+    whole = scale_camera(scene, camera, plan.doublings, plan.side)
+    window = crop_camera(whole, window_buffer.corner, plan.width, plan.height)
     drawn = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
+    inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     image, depth, acc = paste_window(drawn, window_buffer.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
@@ -355,9 +345,7 @@ def paste_window(
     layers = jnp.concatenate([drawn[..., :3] * alpha, alpha, drawn[..., 4:] * alpha], axis=-1)
     empty = jnp.zeros((height + drawn.shape[0], width + drawn.shape[1], 5), layers.dtype)
     start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
-    sums = jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width]
-    if side > 1:
-        sums = average_pool(sums, side)
+    sums = average_pool(jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width], side)
     acc = sums[..., 3]
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
 from spnr_jax.kernels.numerics import (
     clamp,
+    dot,
     larger,
     normalize,
     one_minus_exp,
@@ -129,9 +130,11 @@ def compute_inputs(
     confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
     color = clamp(blended + confidence * clamp(buffer.color - blended, -SHARPEST, SHARPEST), 0, 1)
     normal, ray = _directions(buffer, camera)
-    cosine = -reduce(add, (n * v for n, v in zip(normal, ray, strict=True)))
+    cosine = -dot(normal, ray)
     mirrored = [v + 2 * cosine * n for n, v in zip(normal, ray, strict=True)]
-    normal_in_world, mirrored_in_world = (_to_world(camera, direction) for direction in (normal, mirrored))
+    normal_in_world, mirrored_in_world = (
+        [dot(row, direction) for row in camera.cam_to_world[:, :3]] for direction in (normal, mirrored)
+    )
     factor, summand = lighting.reflectance(of["roughness"], clamp(cosine, 0.05, 1))
     spacing = jnp.exp(buffer.log_spacing)
     in_pixels = larger(spacing, 1e-6) * camera.intrinsics[0, 0] / larger(buffer.depth, 0.1)
@@ -178,12 +181,6 @@ def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Arra
     up = jnp.broadcast_to(-((down - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])[:, None], size.shape)
     length = jnp.sqrt(right**2 + up**2 + 1)
     return normal, [right / length, up / length, -1 / length]
-
-
-def _to_world(camera: Camera, direction: list[Array]) -> list[Array]:
-    pose = camera.cam_to_world
-    x, y, z = direction
-    return [pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z for i in range(3)]
 
 
 def _relief(buffer: GBuffer, spacing: Float[Array, "height width"], reach: int) -> Float[Array, "height width"]:

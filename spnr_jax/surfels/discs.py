@@ -251,7 +251,8 @@ def _find_line(
     normal = jnp.stack(
         [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
     )
-    direction = unit(_solve_plane(normal, CONSTANTS.color_edge_ridge)[:, 0])
+    stiff = jnp.asarray([1e-6, CONSTANTS.color_edge_ridge, CONSTANTS.color_edge_ridge], normal.dtype)
+    direction = unit(solve(normal[:, :3] + jnp.diag(stiff)[..., None], normal[:, 3:])[1:, 0])
     height = jax.lax.optimization_barrier(uv[:, 0] * direction[0][None] + uv[:, 1] * direction[1][None])
     there = weight > CONSTANTS.color_edge_least_weight
     last = largest(jnp.where(there & ~beyond, height, 0))  # the point itself lies at 0
@@ -259,12 +260,6 @@ def _find_line(
     some = first < jnp.inf
     distance = larger(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
     return direction, distance, sum_first(weight * (beyond != (height > distance[None])))
-
-
-def _solve_plane(normal: Float[Array, "3 columns block"], ridge: float) -> Float[Array, "2 sides block"]:
-    """Slopes of a linear regression over the plane, from its normal equations beside their right-hand sides."""
-    stiff = jnp.diag(jnp.asarray([1e-6, ridge, ridge], normal.dtype))[..., None]
-    return solve(normal[:, :3] + stiff, normal[:, 3:])[1:]
 
 
 def _mean(sums: Float[Array, "sums block"], columns: slice) -> Float[Array, "columns block"]:

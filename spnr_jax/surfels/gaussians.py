@@ -208,7 +208,9 @@ def color_splats(gaussians: Gaussians, views: Sequence[View], *, side: float, de
         opacity, depth = view.opacity[row, column], view.depth[row, column]
         with np.errstate(invalid="ignore"):
             near = inside & (distance < depth + BEHIND * side)
-            before = near & (distance < nearest_around(view.depth)[row, column] - BEFORE * side)
+            # depth is blurred at its jumps: the least around each pixel
+            least = minimum_filter(np.where(np.isnan(view.depth), np.inf, view.depth), 3)
+            before = near & (distance < least[row, column] - BEFORE * side)
         contradicting += before | (inside & (opacity < EMPTY))
         cosine = -np.einsum("ni,ni->n", towards, normal)  # a thin sheet has splats on both sides
         visible = np.flatnonzero(near & ~before & (opacity > SOLID) & (cosine > 0))
@@ -227,11 +229,6 @@ def color_splats(gaussians: Gaussians, views: Sequence[View], *, side: float, de
     harmonics = np.linalg.solve(matrix[kept] + ridge, right[kept])
     columns = {name: np.asarray(x)[kept] for name, x in vars(gaussians).items()}
     return Gaussians(**columns | {"harmonics": harmonics.astype(np.float32)})
-
-
-def nearest_around(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Least depth of each pixel and its neighbours, infinite where there is none: depth is blurred at its jumps."""
-    return minimum_filter(np.where(np.isnan(depth), np.inf, depth), 3)
 
 
 def _pixels(position: Float[np.ndarray, "splats 3"], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

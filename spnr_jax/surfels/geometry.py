@@ -75,16 +75,9 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
         real = np.flatnonzero(mask[cloud_index])
         if len(real):
             given = None if normals is None else normals[cloud_index][real]
-            near = nearest(positions[cloud_index][real], given)
+            near = _query(cKDTree(positions[cloud_index][real]), np.arange(len(real)), given)
             found[cloud_index][real] = np.where(near < 0, -1, real[near])
     return found
-
-
-def nearest(
-    positions: Float[np.ndarray, "points 3"], normals: Float[np.ndarray, "points 3"] | None = None
-) -> Int[np.ndarray, "points 20"]:
-    """`neighbors` of real points."""
-    return _query(cKDTree(positions), np.arange(len(positions)), normals)
 
 
 def order_in_space(

@@ -16,10 +16,10 @@ disc covers, and the order of the entries, are integers without a gradient.  Siz
 are counted.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import reduce
 from itertools import product
-from operator import add, mul
+from operator import mul
 from typing import NamedTuple
 
 import jax
@@ -28,7 +28,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
-from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep, split_columns
+from spnr_jax.kernels.numerics import (
+    clamp,
+    cross,
+    dot,
+    larger,
+    one_minus_exp,
+    safe_sqrt,
+    smaller,
+    smoothstep,
+    split_columns,
+)
 from spnr_jax.kernels.records import AnyArray, Camera, GBuffer, Surfels
 
 # --- entries ----------------------------------------------------------------------------------------------------------
@@ -82,14 +92,6 @@ class Entries(NamedTuple):
     rank: Int[Array, " entries"]
 
 
-def _cross(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
-
-
 def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
     """Discs projected to a camera; back faces and discs behind the camera or outside the picture cover no pixel."""
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
@@ -102,7 +104,7 @@ def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
         )
     )
     normal = numerics.rotate_columns(rotation, surfels.normal)
-    cosine = -(normal[0] * x + normal[1] * y + normal[2] * z) / larger(safe_sqrt(x * x + y * y + z * z), NEAR_PLANE)
+    cosine = -dot(normal, (x, y, z)) / larger(safe_sqrt(dot((x, y, z), (x, y, z))), NEAR_PLANE)
     facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
     ahead = larger(-z, NEAR_PLANE)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
@@ -182,7 +184,7 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     # gather whole columns once instead of at every use: twenty times faster on a CPU
     rotation = camera.cam_to_world[:, :3]
     rim = numerics.rotate_columns(rotation, surfels.rim_tangent)
-    side = _cross(foot.normal, rim)
+    side = cross(foot.normal, rim)
     far = tuple(split_columns(jnp.asarray(surfels.rim_distances)))
     foot, begin, point, rim, side, far = jax.lax.optimization_barrier((foot, end - covered, point, rim, side, far))
     x, y, z, nx, ny, nz = (column[point] for column in (*foot.centre, *foot.normal))
@@ -200,8 +202,8 @@ def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[En
     ahead = ray_depth > 0  # else the eye is between the disc's plane and the ray, as where it is close to a floor
     ray_depth = clamp(ray_depth, -z - 2 * radius, -z + 2 * radius)
     there = [RADIUS / radius * x for x in (ray_depth * right - x, ray_depth * up - y, -ray_depth - z)]  # in spacings
-    in_plane = _dot(there, there) / RADIUS**2
-    along, across = _dot(there, [c[point] for c in rim]), _dot(there, [c[point] for c in side])
+    in_plane = dot(there, there) / RADIUS**2
+    along, across = dot(there, [c[point] for c in rim]), dot(there, [c[point] for c in side])
     ends = [r[point] - x for r, x in zip(far, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
     on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / MIN_RADIUS**2
@@ -339,18 +341,13 @@ def _build_lists(entries: Entries, slots: int, pixels: int) -> tuple[Int[Array, 
     return table.reshape(LIST_LENGTH, slots), pixel_of
 
 
-@jax.checkpoint
-def compute_blend_weights(
+def _blend_weights(
     tau: Float[Array, "list slots"], depth: Float[Array, "list slots"], spacing: Float[Array, "list slots"]
 ) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"]]:
     """Blend weight of each entry, and the transmittance in front of it, for lists sorted by depth.
 
     A group of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
     """
-    return _blend_weights(tau, depth, spacing)
-
-
-def _plain_blend_weights(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
     tau_before, tau_group = _optical_depths(tau, depth, spacing)
     transmittance = jnp.exp(-tau_before)
     return tau * transmittance * _mean_transmittance(tau_group)[0], transmittance
@@ -392,7 +389,7 @@ def _pull_back_blend_weights(
     return by_tau, by_depth, by_spacing
 
 
-_blend_weights = numerics.with_gradient(_plain_blend_weights, _pull_back_blend_weights)
+compute_blend_weights = jax.checkpoint(numerics.with_gradient(_blend_weights, _pull_back_blend_weights))
 
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:

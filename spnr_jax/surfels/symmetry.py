@@ -133,16 +133,10 @@ def measure_surface(cloud: PointCloud, limits: Limits) -> Surface:
     """The points of a cloud with their normals, given or estimated."""
     position = np.asarray(cloud.positions, np.float64)
     tree = cKDTree(position)
-    _, around, spacing = measure_distances(tree)
+    distance, around = tree.query(position, list(range(1, AROUND + 1)))
+    spacing = max(float(np.median(distance[:, 1:7].mean(axis=1))), np.finfo(np.float64).tiny)
     normal = estimate_normals(position, tree) if cloud.normals is None else unit(np.asarray(cloud.normals, np.float64))
     return Surface(position, normal, spacing, limits, around, tree)
-
-
-def measure_distances(tree: cKDTree) -> tuple[Float[np.ndarray, "n 12"], Int[np.ndarray, "n 12"], float]:
-    """Distances to the nearest points of a tree, themselves first, the points' indices, and the median spacing."""
-    distance, around = tree.query(tree.data, list(range(1, AROUND + 1)))
-    spacing = float(np.median(distance[:, 1:7].mean(axis=1)))
-    return distance, around, max(spacing, np.finfo(np.float64).tiny)
 
 
 def find_planes(surface: Surface) -> list[Plane]:

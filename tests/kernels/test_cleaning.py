@@ -184,9 +184,3 @@ def test_masked_points_neither_count_nor_stay_where_something_is_done():
     np.testing.assert_array_equal(cleaned.positions, expected.positions)
     assert cleaned.mask.all()
     assert lines == said
-
-
-def test_a_batch_of_clouds_is_refused():
-    plain = cloud(sphere(10, "even"))
-    with pytest.raises(ValueError, match=r"takes one cloud, .* got shape \(1, 10, 3\)"):
-        spnr_jax.clean(plain.replace(**{name: x[None] for name, x in vars(plain).items() if x is not None}))

@@ -40,8 +40,6 @@ class TestWeights:
 
 
 class TestComposite:
-    weights, _ = volume_weights(DENSITY, DELTA)
-
     def test_an_empty_ray_is_exactly_the_background_and_values_get_no_gradient(self):
         def white(values):
             weights, _ = volume_weights(jnp.zeros((2, 3, 8)), DELTA)
@@ -57,7 +55,6 @@ class TestComposite:
 class TestExpectedDistance:
     distances = jnp.cumsum(DELTA, axis=-1)
     far = DELTA.sum(-1) + 0.5
-    weights, _ = volume_weights(DENSITY, DELTA)
 
     def test_light_that_nothing_stops_counts_as_far_with_a_finite_gradient(self):
         def distance(density):
@@ -69,7 +66,6 @@ class TestExpectedDistance:
 
 class TestUnionWeights:
     coarse = jnp.sort(numbers(6, 2, 3, 5), axis=-1)
-    fine = jnp.sort(numbers(7, 2, 3, 4), axis=-1)
     density = 3 * numbers(8, 2, 3, 9, low=0.0)
     far = jnp.full((2, 3), 1.5)
 

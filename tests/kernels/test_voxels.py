@@ -88,11 +88,15 @@ class TestScatterConv:
     kernel = numbers(5, 3, 3, 3, 3, 4)
 
     @staticmethod
-    def dense(positions, features, mask, kernel):
-        volume, occupancy = scatter_mean(positions, features, mask, D)
-        volume = jnp.concatenate([volume, occupancy[..., None]], axis=-1)
+    def volume(positions, features, mask):
+        means, occupancy = scatter_mean(positions, features, mask, D)
+        return jnp.concatenate([means, occupancy[..., None]], axis=-1)
+
+    def dense(self, *points_and_kernel):
+        *points, kernel = points_and_kernel
         numbering = ("NDHWC", "DHWIO", "NDHWC")
-        return lax.conv_general_dilated(volume[None], kernel, (1, 1, 1), "SAME", dimension_numbers=numbering)[0]
+        volume = self.volume(*points)[None]
+        return lax.conv_general_dilated(volume, kernel, (1, 1, 1), "SAME", dimension_numbers=numbering)[0]
 
     @staticmethod
     def sparse(positions, features, mask, kernel):
@@ -111,13 +115,7 @@ class TestScatterConv:
 
         sparse, dense = both(self.sparse), both(self.dense)
         close(sparse, dense, rtol=1e-4, atol=1e-5)
-        volume = np.concatenate(
-            [
-                x if x.ndim == 4 else x[..., None]
-                for x in map(np.asarray, scatter(POSITIONS[0, 0], FEATURES[0, 0], mask, D))
-            ],
-            axis=-1,
-        )
+        volume = self.volume(POSITIONS[0, 0], FEATURES[0, 0], mask)
         close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
 
 

@@ -45,8 +45,9 @@ def around_zero(*shape):
     return lambda rng: (rng.uniform(0.2, 3, shape) * rng.choice([-1, 1], shape),)
 
 
-def unit(x):
-    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+def unit(vectors):
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
 
 
 # numbers and vectors
@@ -57,11 +58,6 @@ def quotient(numerator, denominator):
     zero = np.abs(denominator) < TINY
     found = numerator / np.where(zero, 1, denominator)
     return np.where(zero | (np.abs(found) < TINY), 0, found)
-
-
-def direction(vectors):
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1)
 
 
 def encode_srgb(x):
@@ -97,7 +93,7 @@ NUMBERS = (
         Extremes((extremes(6, high=36),)), agreement=1e-8),
     Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
         Extremes((vectors,))),
-    Law("normalize", numerics.normalize, direction, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
+    Law("normalize", numerics.normalize, unit, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
     Law("linear_to_srgb", imaging.linear_to_srgb, encode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),
         Extremes((extremes(6, high=15),), rtol=2e-6)),
     Law("srgb_to_linear", imaging.srgb_to_linear, decode_srgb, usual(lambda rng: (rng.uniform(-0.1, 1, (6, 4)),)), (1,),

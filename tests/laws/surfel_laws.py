@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from kernel_laws import FINITE, sizes, unit, usual
 from support import reference
 from support.laws import TINY, Axis, Extremes, Law, close, extremes
-from support.surfel_clouds import surfels
+from support.surfel_clouds import surfels, tangents
 
 from spnr_jax.kernels import numerics
 from spnr_jax.kernels.records import Light
@@ -47,14 +47,6 @@ def normals(rng, angle):
     """Unit normals about that far from straight down."""
     turn, away = rng.uniform(0, 6, POINTS), angle * rng.uniform(0.5, 1, POINTS)
     return (np.stack([np.cos(turn) * np.sin(away), np.sin(turn) * np.sin(away), -np.cos(away)]),)
-
-
-def frame_twin(normal):
-    sign = np.where(normal[2] >= 0, 1, -1)
-    a = -1 / (sign + normal[2])
-    (x, y, _), b = normal, normal[0] * normal[1] * a
-    first = [1 + sign * x**2 * a, sign * b, -sign * x]
-    return np.stack([np.stack(first), np.stack([b, sign + y**2 * a, -y]), normal])
 
 
 def some_normals(vectors):
@@ -101,7 +93,7 @@ SYSTEMS = (
         (Axis("ridge of unknowns", 1, 10, 1e6, systems),), shared=0),
     Law("solve, one unknown", numerics.solve, lambda matrix, right: right / matrix[:1],
         usual(lambda rng: (rng.uniform(1, 2, (1, 1, POINTS)), rng.normal(size=(1, 3, POINTS))))),
-    Law("frame", numerics.tangent_frame, frame_twin,
+    Law("frame", numerics.tangent_frame, lambda normal: np.stack([*(x.T for x in tangents(normal.T)), normal]),
         (Axis("angle from straight down", 1e-6, 1, 1.5, normals),), shared=0,
         extremes=Extremes((extremes(9, 3).map(some_normals),), floors=(FINITE,), check=are_frames, twin=False)),
     Law("cross and dot", lambda a, b: (numerics.cross(a, b), numerics.dot(a, b)),

@@ -16,7 +16,7 @@ CALLS = {
     "neighbors(cloud.replace(mask=np.ones(9)))": "neighbors: cloud.mask is of type float64, expected bool",
     "encode(None, cloud.replace(roughness=np.zeros((9, 1))), near)": "encode: cloud.roughness has the shape (9, 1), e",
     "encode(None, cloud.replace(base_color=np.zeros((8, 3))), near)": "encode: cloud.base_color has the shape (8, 3)",
-    "encode(None, jax.tree.map(lambda x: x[None], cloud), near)": "encode: cloud.mask has the shape (1, 9), expected",
+    "encode(None, some(cloud), near)": "encode: cloud.mask has the shape (1, 9), expected",
     "encode(None, cloud, near[:, :8])": "encode: neighbors has the shape (9, 8), expected (9, 20); they are",
     "densify({'densifier': {}}, cloud, near[:8])": "densify: neighbors has the shape (8, 20), expected (9, 20)",
     "plan(scene, camera.replace(cam_to_world=np.eye(4)))": "plan: expected a pose (3, 4) and intrinsics (3, 3)",
@@ -31,7 +31,7 @@ CALLS = {
     "model.render(volume, camera.replace(intrinsics=-camera.intrinsics))": "render: a focal length of camera.intrin",
     "light + 1": "unsupported operand type",
     "render(None, cloud, camera, plan=None)": "render: expected a scene of spnr_jax.encode",
-    "model.encode(jax.tree.map(lambda x: x[None], cloud))": "encode: cloud.mask has the shape (1, 9)",
+    "model.encode(some(cloud))": "encode: cloud.mask has the shape (1, 9)",
     "model.render(volume, camera, light='studio')": "light: expected a Light",
     "model.render(volume, camera, light=jax.tree.map(lambda x: x[:6], light))": "light.tables has the shape (6, 32",
     "model.camera(scene, resolution=0)": "camera: resolution=0 is no number of pixels",
@@ -66,6 +66,20 @@ CALLS = {
     "render(None, scene, rows[0, :3], plan=None)": "camera: expected a Camera, as of model.camera or cameras.pinhole",
     "model.render(volume, [camera])": "camera: expected a Camera, as of model.camera or cameras.pinhole, got list",
     "spnr_jax.losses.mse(cloud.mask, cloud.mask)": "mse: expected floats in [0, 1], got bool and bool",
+    "spnr_jax.metrics.ssim(rows, rows)": "ssim needs images of at least 11 pixels, got (4, 9)",
+    "spnr_jax.sampling.importance(None, rows[0, :, 0], rows[0, :, 0], 4)": "importance: 9 edges have one weight less",
+    "spnr_jax.clean(some(cloud))": "clean takes one cloud, positions (points, 3); got shape",
+    "model.encode(jax.tree.map(lambda x: x[:0], cloud))": "encode: the cloud has no points",
+    "model.encode(cloud.replace(mask=np.zeros(9, bool)))": "encode: the cloud has no points",
+    "model.encode(cloud.replace(positions=np.nan * rows[0]))": "the cloud has NaN or infinity in its positions",
+    "model.encode(cloud.replace(base_color=np.inf * rows[1]))": "the cloud has NaN or infinity in its base_color",
+    "model.encode(cloud.replace(roughness=np.nan * rows[2, :, 0]))": "the cloud has NaN or infinity in its roughness",
+    "model.encode(cloud.replace(metallic=np.inf * rows[2, :, 0]))": "the cloud has NaN or infinity in its metallic",
+    "model.render(volume, camera, 'fast')": "quality must be one of draft, balanced, best, trained, got fast",
+    "render(None, scene, some(camera), plan=plan(scene, camera))": "render: camera.cam_to_world has the shape (1, 3",
+    "render(None, some(scene), camera, plan=plan(scene, camera))": "render: scene.centre has the shape (1, 3), expect",
+    "render(None, scene, camera, some(light), plan=plan(scene, camera))": "light.tables has the shape (1, 7, 32, 64",
+    "render(None, scene, camera, plan=plan(scene, camera)._replace(slots=0))": "render: Plan(doublings=",
 }
 SCRIPT = """
 import json, sys
@@ -78,6 +92,7 @@ rows = np.random.default_rng(0).random((4, 9, 3)).astype(np.float32)
 cloud = make_cloud(*rows[:2], *rows[2:, :, 0])
 near, light, model = neighbors(cloud), spnr_jax.sun(40, 30), spnr_jax.load()
 scene = jax.jit(encode)(None, cloud, near)
+some = lambda tree: jax.tree.map(lambda x: x[None], tree)
 camera, volume = model.camera(scene, resolution=16), spnr_jax.Volume(scene, scene.centre, scene.scale)
 said = []
 for call in json.loads(sys.argv[1]):

@@ -131,5 +131,6 @@ def test_looking_away_is_exactly_white_and_pulls_at_nothing_in_the_scene(variabl
     rendering, by_weights, by_inputs = see(variables, cloud(), camera(target=(1.0, 1.6, 6.0)))
     assert (rendering.image_lr == 1).all()
     assert (rendering.acc == 0).all()
+    assert (rendering.depth == 0).all()
     assert all((x == 0).all() for x in jax.tree.leaves(by_inputs))
     assert all((x == 0).all() for part in ("encoder", "field") for x in jax.tree.leaves(by_weights[part]))

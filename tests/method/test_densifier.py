@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.laws import close
-from support.surfel_clouds import cloud, shape
+from support.surfel_clouds import cloud, lumpy_ball, shape
 
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
@@ -20,21 +20,12 @@ from spnr_jax.training import weights
 
 COUNT, SIZE = 150, 512  # real points, and with padding; whole clouds have as many, so that they share programs
 run = jax.jit(densifier.densify)
+ball = functools.cache(functools.partial(lumpy_ball, COUNT, SIZE, noise=0.1))
 
 
 @pytest.fixture(scope="module")
 def params():
     return {"densifier": weights.read_variables(weights.packaged_file("densifier"))}
-
-
-@functools.cache
-def ball(seed=0):
-    """A lumpy ball of two colors in units of its own, padded."""
-    rng = np.random.default_rng(seed)
-    normals = shape("sphere", COUNT, "random")[1]
-    positions = 30 + 7 * normals * (1 + 0.2 * np.sin(3 * normals[:, :1])) * [1, 1.3, 0.8]
-    colors = np.where(normals[:, :1] > 0.2, [0.8, 0.3, 0.1], [0.1, 0.3, 0.6])
-    return pad(cloud(positions + 0.1 * rng.normal(size=(COUNT, 3)), base_color=colors), SIZE)
 
 
 def kept(dense):

@@ -1,7 +1,6 @@
 """The handle: any units, any number of points, one camera or many, and the same picture whatever the memory allows."""
 
 import dataclasses
-import inspect
 
 import jax
 import numpy as np
@@ -14,7 +13,7 @@ import spnr_jax
 from spnr_jax.config import RenderOptions, SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import LARGEST_REACH, Camera, Volume
+from spnr_jax.kernels.records import LARGEST_REACH, Volume
 from spnr_jax.method import model, paper_method
 
 
@@ -51,13 +50,7 @@ def test_the_cameras_of_the_handle_look_at_the_middle_of_the_cloud(handle):
 def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
     volume = handle.encode(example_cloud())
     single = [handle.camera(volume, azimuth, 20.0) for azimuth in (0.0, 100.0)]
-    stacked = Camera(
-        cam_to_world=jax.numpy.stack([c.cam_to_world for c in single]),
-        intrinsics=jax.numpy.stack([c.intrinsics for c in single]),
-        height=single[0].height,
-        width=single[0].width,
-    )
-    together = handle.render(volume, stacked)
+    together = handle.render(volume, jax.tree.map(lambda *x: jax.numpy.stack(x), *single))
     for i, camera in enumerate(single):
         close(jax.tree.map(lambda x, i=i: x[i], together), handle.render(volume, camera), atol=1e-5)
 
@@ -68,11 +61,8 @@ def test_the_handle_shows_what_the_evaluation_shows(handle):
     encoded = tiny_model.encode(
         handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
     )
-    volume = Volume(
-        scene=jax.tree.map(lambda x: x[0], encoded),
-        centre=jax.numpy.zeros(3),
-        scale=jax.numpy.ones(()),
-    )
+    scene = jax.tree.map(lambda x: x[0], encoded)
+    volume = Volume(scene=scene, centre=jax.numpy.zeros(3), scale=jax.numpy.ones(()))
     views = jax.tree.map(jax.numpy.asarray, item.camera)
     close(handle.render(volume, views, "trained"), expected, atol=1e-5)
 
@@ -83,22 +73,6 @@ def test_points_that_are_masked_do_not_count(handle):
     longer.mask[40:] = False
     longer.positions[40:] = 1e6
     close(handle.encode(longer), handle.encode(cloud))
-
-
-def test_a_cloud_without_points_is_refused(handle):
-    cloud = example_cloud(3)
-    for empty in (jax.tree.map(lambda x: x[:0], cloud), dataclasses.replace(cloud, mask=np.zeros(3, bool))):
-        with pytest.raises(ValueError, match="no points"):
-            handle.encode(empty)
-
-
-@pytest.mark.parametrize("name", ["positions", "base_color", "roughness", "metallic"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_number_that_is_not_finite_is_refused_by_its_name(name, value, handle):
-    cloud = example_cloud(3)
-    getattr(cloud, name)[1] = value
-    with pytest.raises(ValueError, match=f"NaN or infinity in its {name}"):
-        handle.encode(cloud)
 
 
 def test_an_odd_picture_is_refused_where_the_network_doubles(handle):
@@ -119,12 +93,6 @@ class TestQuality:
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
         expected = samples and RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=3))
         assert paper_method.choose_options(config, quality, 3) == expected
-
-    def test_another_word_is_refused(self, handle):
-        volume = handle.encode(example_cloud())
-        unchecked = inspect.unwrap(model.Model.render_each)  # the tests' type check would refuse it first
-        with pytest.raises(ValueError, match="quality must be one of draft, balanced, best, trained, got fast"):
-            unchecked(handle, volume, [handle.camera(volume)], "fast")
 
     @pytest.mark.parametrize("quality", ["draft", "balanced", "best", "trained"])
     def test_every_quality_shows_the_object(self, handle, quality):

@@ -288,15 +288,3 @@ def test_strange_cameras_lights_and_units_have_finite_pictures_and_gradients(
     if name == "an empty picture":
         assert np.all(np.asarray(found[0][1].acc) == 0)
         assert np.all(np.asarray(found[0][1].image) == 1)
-
-
-def test_other_shapes_than_one_object_one_view_and_one_light_are_refused_in_one_line(params, scenes, views, lights):
-    for scene, seen, light, named in (
-        (scenes[0], stacked(views), lights[0], "camera.cam_to_world"),
-        (stacked(scenes), views[0], lights[0], "scene.centre"),
-        (scenes[0], views[0], stacked(lights), "light.tables"),
-    ):
-        with pytest.raises(ValueError, match=named):
-            render(params, scene, seen, light, plan=ROOM)
-    with pytest.raises(ValueError, match="size below 1"):
-        render(params, scenes[0], views[0], plan=ROOM._replace(slots=0))

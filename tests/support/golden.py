@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 
 import spnr_jax
-from support.surfel_clouds import cloud
+from support.surfel_clouds import cloud, even_square
 
 FILE = Path(__file__).with_name("golden.npz")
 SIZE, VIEW = 64, {"azimuth": 35.0, "elevation": 25.0}
 
 
 def sequence(count: int) -> np.ndarray:
-    """Points (count, 2) in [0, 1), evenly spread: Roberts' R2 sequence."""
-    ratio = 1.32471795724474602596  # x^3 = x + 1
-    return (0.5 + np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 3)) % 1
+    """Points (count, 2) in [0, 1), evenly spread."""
+    return even_square(count) / 2 % 1
 
 
 def torus(count: int = 1000) -> spnr_jax.PointCloud:

@@ -49,6 +49,15 @@ def cloud(positions, **columns) -> PointCloud:
     return PointCloud(positions=np.asarray(positions, np.float32), mask=np.ones(count, bool), **columns)
 
 
+def lumpy_ball(count: int, size: int, seed: int = 0, noise: float = 1.0) -> PointCloud:
+    """Random points of a lumpy ball of two colours in units of its own, padded to a size."""
+    rng = np.random.default_rng(seed)
+    normals = shape("sphere", count, "random")[1]
+    positions = 30 + 7 * normals * (1 + 0.2 * np.sin(3 * normals[:, :1])) * [1, 1.3, 0.8]
+    colors = np.where(normals[:, :1] > 0.2, [0.8, 0.3, 0.1], [0.1, 0.3, 0.6]) + 0.1 * rng.random((count, 3))
+    return pad(cloud(positions + noise * rng.normal(size=(count, 3)), base_color=colors), size)
+
+
 def tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors orthogonal to each unit normal and to each other (Duff et al. 2017)."""
     x, y, z = normals.T
@@ -57,7 +66,7 @@ def tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     b = x * y * a
     first = np.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
     second = np.stack([b, sign + y**2 * a, -y], axis=-1)
-    return first.astype(np.float32), second.astype(np.float32)
+    return first, second
 
 
 _estimate = jax.jit(estimate_surfels)

@@ -15,6 +15,7 @@ from spnr_jax.surfels import splatting
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
 VIEW = (1.4, 0.9, 1.7)
+BALL = surfels(*shape("sphere", 500))
 
 
 def sky():
@@ -30,18 +31,16 @@ def drawn(found, light, view):
 
 
 def test_normals_of_discs_seen_from_behind_are_turned_to_the_camera_and_others_kept():
-    positions, normal, spacing = shape("sphere", 500)
-    found, view = surfels(positions, normal, spacing), camera(24)
-    turned = shader.face_camera(found, view).normal
+    positions, normal, _ = shape("sphere", 500)
+    view = camera(24)
+    turned = shader.face_camera(BALL, view).normal
     towards = np.asarray(view.cam_to_world)[:, 3] - positions
     assert np.all(np.sum(towards * np.asarray(turned), axis=1) >= 0)
     close(turned, normal * np.where(np.sum(towards * normal, axis=1) < 0, -1, 1)[:, None])
 
 
 def test_the_network_sees_no_light():
-    positions, normal, spacing = shape("sphere", 500)
-    found, view = surfels(positions, normal, spacing), camera(24)
-    (_, one, _), (_, other, _) = (drawn(found, light_of(scale * sky()), view) for scale in (0.0, 3.0))
+    (_, one, _), (_, other, _) = (drawn(BALL, light_of(scale * sky()), camera(24)) for scale in (0.0, 3.0))
     assert one.shape == (24, 24, shader.NUM_FEATURES)
     close(one, other)
 
@@ -51,10 +50,8 @@ def test_the_network_sees_no_light():
 def test_one_input_says_whether_materials_are_unknown_and_one_whether_points_are_learned_and_no_other_does(
     name, column, share
 ):
-    positions, normal, spacing = shape("sphere", 500)
-    plain = surfels(positions, normal, spacing)
-    said = dataclasses.replace(plain, **{name: jnp.full(500, share)})
-    (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (plain, said))
+    said = dataclasses.replace(BALL, **{name: jnp.full(500, share)})
+    (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (BALL, said))
     one, other = np.array(one), np.array(other)
     assert np.all(one[..., column] == 0)
     inside = np.asarray(buffer.opacity) > 0.9
@@ -64,13 +61,9 @@ def test_one_input_says_whether_materials_are_unknown_and_one_whether_points_are
 
 
 def test_the_last_number_tells_a_texture_from_one_colour():
-    positions, normal, spacing = shape("sphere", 500)
-    grey = surfels(positions, normal, spacing)
     patches = np.where(np.random.default_rng(0).random((500, 1)) < 0.5, 0.1, 0.9) * np.ones(3)
-    (buffer, one, _), (_, other, _) = (
-        drawn(found, light_of(sky()), camera(24, VIEW))
-        for found in (grey, surfels(positions, normal, spacing, base_color=patches))
-    )
+    painted = surfels(*shape("sphere", 500), base_color=patches)
+    (buffer, one, _), (_, other, _) = (drawn(found, light_of(sky()), camera(24, VIEW)) for found in (BALL, painted))
     inside = np.asarray(buffer.opacity) > 0.9
     assert np.asarray(one)[inside, -1].max() < 1e-2
     assert 0.1 < np.asarray(other)[inside, -1].mean() <= 0.4 + 1e-3
