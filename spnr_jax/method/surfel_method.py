@@ -22,7 +22,7 @@ from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Sizes
+from spnr_jax.method.surfel_renderer import Resolution, Sizes
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
@@ -33,11 +33,11 @@ BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab
 
 
 class PlannedView(NamedTuple):
-    """A view with its light: the camera that is drawn (smaller for `balanced`), (doublings, side), sizes needed."""
+    """A view with its light: the camera that is drawn (smaller for `balanced`), resolution and sizes."""
 
     camera: Camera
     light: Light
-    resolution: tuple[int, int]
+    resolution: Resolution
     needed: Sizes
 
 
@@ -103,7 +103,7 @@ def render(
 
     def draw(view: PlannedView, whole: Camera) -> Rendering:
         if view.needed.entries:
-            plan = surfel_renderer.round_sizes(common[view.resolution], *view.resolution)
+            plan = surfel_renderer.round_sizes(common[view.resolution], view.resolution)
             window_buffer = _rasterize(volume.scene, view.camera, view.light, plan=plan)
             drawn = _shade(weights, volume.scene, view.camera, view.light, window_buffer, plan=plan)
         else:
@@ -120,9 +120,9 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
         camera = cameras.resize(
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
         )
-    doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
-    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
-    return PlannedView(camera, light or room_light(), (doublings, side), needed)
+    resolution = surfel_renderer.choose_resolution(scene, camera, render_scale)
+    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, **resolution._asdict()))
+    return PlannedView(camera, light or room_light(), resolution, needed)
 
 
 @partial(CachedProgram, options=QUICKEST)

@@ -70,6 +70,13 @@ class Plan(NamedTuple):
     slots: int
 
 
+class Resolution(NamedTuple):
+    """Resolution of the G-buffer: side / 2^doublings of the picture's (as in `Plan`)."""
+
+    doublings: int
+    side: int
+
+
 class Sizes(NamedTuple):
     """Sizes that a picture needs: window width and height, entries, upper bound of covered pixels; arrays or ints."""
 
@@ -105,9 +112,9 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     each = int(np.prod(batch[len(objects) :], dtype=int))
     scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
-    doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
-    needed = jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs])
-    return round_sizes(max_sizes(needed), doublings, side)
+    finest = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of.doublings, -of.side))
+    needed = jax.device_get([count_sizes(*pair, **finest._asdict()) for pair in pairs])
+    return round_sizes(max_sizes(needed), finest)
 
 
 def check_camera(camera: Camera, where: str) -> None:
@@ -124,8 +131,8 @@ def check_camera(camera: Camera, where: str) -> None:
         raise UserError(f"{where}: camera.cam_to_world is no rotation; was `up` along the view, or the pose scaled?")
 
 
-def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
-    """Doublings by the network, and `side`, from the scene's spacing in pixels at its centre, not nearer than NEAREST.
+def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> Resolution:
+    """The resolution for the scene's spacing in pixels at its centre, which counts as not nearer than NEAREST.
 
     `render_scale` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
     """
@@ -134,7 +141,7 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
     pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / render_scale / max(distance, NEAREST)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     finest = FINEST_OF_SMALL if max(camera.height, camera.width) / render_scale <= SMALL else FINEST
-    return doublings, 2 if pixels < finest else 1
+    return Resolution(doublings, 2 if pixels < finest else 1)
 
 
 @partial(CachedProgram, static=("doublings", "side"))
@@ -153,10 +160,10 @@ def max_sizes(needed: Iterable[Sizes]) -> Sizes:
     return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
 
 
-def round_sizes(sizes: Sizes, doublings: int, side: int) -> Plan:
+def round_sizes(sizes: Sizes, resolution: Resolution) -> Plan:
     """The plan that holds these sizes; counts are rounded up to powers of the root of two, so that few are compiled."""
     entries, slots = _round_count(sizes.entries, LEAST_ENTRIES), _round_count(sizes.slots, LEAST_SLOTS)
-    return Plan(doublings, side, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
+    return Plan(*resolution, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
 
 
 def _round_count(count: int, least: int) -> int:
@@ -280,9 +287,9 @@ def shade_window(
     """The second half: the network over the G-buffer."""
     whole = scale_camera(scene, camera, plan.doublings, plan.side)
     window = crop_camera(whole, window_buffer.corner, plan.width, plan.height)
-    drawn = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
+    layers = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
-    image, depth, acc = paste_window(drawn, window_buffer.corner * 2**plan.doublings, inside, plan.side)
+    image, depth, acc = paste_window(layers, window_buffer.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
 
@@ -315,17 +322,17 @@ def shade(
     *,
     doublings: int,
 ) -> Float[Array, "h w 5"]:
-    """Colour, opacity and depth along the camera's axis in the window, at the doubled resolution."""
+    """Colour times opacity, opacity, and depth along the camera's axis times opacity, at the doubled resolution."""
     if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in inputs.shape[:2]), NUM_OUTPUTS))
     else:
         outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, inputs[None], doublings))
     color, alpha = compose_picture(outputs, maps[None], ambient[None], doublings)
-    held = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
+    known = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
     for _ in range(doublings):
-        held = double_size(held)
-    depth = held[..., :1] / larger(held[..., 1:], 1e-6)  # the mean over pixels that have one
-    return jnp.concatenate([color, alpha[..., None], depth], axis=-1)[0]
+        known = double_size(known)
+    mean = known[..., :1] / larger(known[..., 1:], 1e-6)  # over the pixels that have a depth
+    return (jnp.concatenate([color, jnp.ones_like(mean), mean], axis=-1) * alpha[..., None])[0]
 
 
 def make_shader(params: dict) -> Shader:
@@ -337,13 +344,11 @@ def make_shader(params: dict) -> Shader:
 
 
 def paste_window(
-    drawn: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
+    layers: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
     """Image, depth along rays and opacity of the whole picture: empty outside the window, which may extend beyond."""
     height, width = (n * side for n in (camera.height, camera.width))
-    alpha = drawn[..., 3:4]
-    layers = jnp.concatenate([drawn[..., :3] * alpha, alpha, drawn[..., 4:] * alpha], axis=-1)
-    empty = jnp.zeros((height + drawn.shape[0], width + drawn.shape[1], 5), layers.dtype)
+    empty = jnp.zeros((height + layers.shape[0], width + layers.shape[1], 5), layers.dtype)
     start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
     sums = average_pool(jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width], side)
     acc = sums[..., 3]
