@@ -89,7 +89,7 @@ REFUSED = [  # command, what its line says
     (f"{LIT} --light absent.hdr", "absent.hdr: no such file"),
     (f"{LIT} --transparent --background light", "--background light: not together with --transparent"),
     (f"{UNLIT} --light studio", "--light: the network of --run RUN knows the light of its training"),
-    (f"{UNLIT} --turn light", "--turn light: the network of --run RUN knows the light"),
+    (f"{UNLIT} --turn light", "--turn: the network of --run RUN knows the light"),
     (f"{UNLIT} --exposure 1 --sun 0 9", "--sun, --exposure: the network of --run RUN"),
     ("export ball.xyz --splats out.obj", "out.obj"),
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),

@@ -44,8 +44,6 @@ class Lighting:
     """Azimuth and elevation, in degrees, of a sun that is added to the light."""
     exposure: float = 0.0
     """Stops by which the light is brighter (negative: darker)."""
-    background: Literal["white", "light"] = "white"
-    """Background: white, or the environment map, blurred."""
 
     def __post_init__(self) -> None:
         require(self.light != "", "--light: empty; expected a file or a name")
@@ -97,6 +95,12 @@ class CloudOptions:
     lighting: tyro.conf.OmitArgPrefixes[Lighting] = Lighting()
     """Light; only `surfels` takes one other than its training light."""
 
+    @property
+    def light_options_given(self) -> tuple[str, ...]:
+        """Names of the options that need a network that takes a light."""
+        own = (name for name in changed_options(self) if name in ("--background", "--turn"))
+        return (*changed_options(self.lighting), *own)
+
     def __post_init__(self) -> None:
         require_at_least(self, 1, "num_points")
 
@@ -124,11 +128,10 @@ class Share(CloudOptions):
             raise UserError(f"--out {self.out}: expected the name of an .html file")
         require_within(self, -89, 89, "elevation")
         require(math.isfinite(self.azimuth), f"--azimuth must be a number of degrees, got {self.azimuth}")
-        at_white = self.lighting.background == "white"
-        require(at_white, "--background light: a page shows its object on white; leave it out")
 
 
 Output = Literal["image", "depth", "opacity"]
+Background = Literal["white", "light"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +166,8 @@ class Render(CloudOptions):
     films take up to three times as long."""
     outputs: tuple[Output, ...] = ("image", "depth", "opacity")
     """Files to write for each view; depth comes coloured and as .npy."""
+    background: Background = "white"
+    """White, or the environment map, blurred."""
     transparent: bool = False
     """Stills on a transparent background instead of white (straight alpha)."""
     turntable: Literal["gif", "mp4", "none"] = "gif"
@@ -173,11 +178,6 @@ class Render(CloudOptions):
     """Frames of the turntable."""
     fps: int = 16
     """Frames per second of the turntable."""
-
-    @property
-    def light_options_given(self) -> tuple[str, ...]:
-        """Names of the options that need a network that takes a light."""
-        return (*changed_options(self.lighting), *(("--turn light",) if self.turn == "light" else ()))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -193,7 +193,7 @@ class Render(CloudOptions):
         require_drawable(self.resolution)
         if self.turntable == "gif" and self.fps > FASTEST_GIF:
             raise UserError(f"--fps: a .gif shows at most {FASTEST_GIF} frames a second; take --turntable mp4")
-        if self.transparent and self.lighting.background != "white":
+        if self.transparent and self.background != "white":
             raise UserError("--background light: not together with --transparent; give one of them")
 
 
@@ -272,8 +272,6 @@ class Export:
         if wrong := of_cloud[:1] if self.splats is None else of_network[:1]:
             what = "is for --splats FILE, which is not given" if self.splats is None else "is not for --splats"
             raise UserError(f"{wrong[0]} {what}; leave it out")
-        at_white = self.lighting.background == "white"
-        require(at_white, "--background light: splats have no background; leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,6 +282,8 @@ class View(CloudOptions):
     """Address to listen on; one other than this machine's own opens the viewer to a network."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
+    background: Background = "white"
+    """White, or the environment map, blurred."""
     reached_at: str | None = None
     """HOST or HOST:PORT by which browsers reach the viewer, if a proxy before it uses another name."""
     cut: tyro.conf.OmitArgPrefixes[Cut] = Cut()

@@ -23,7 +23,7 @@ from spnr_jax.formats import images
 from spnr_jax.formats.images import NAMES, read_light
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
 from spnr_jax.method.model import Model
-from spnr_jax.tools.commands import Lighting, changed_options
+from spnr_jax.tools.commands import Background, Lighting, changed_options
 from spnr_jax.tools.pictures import light_of_options, put_background
 
 SMALLEST = 256  # pixels along a side of the network's square while things move, at most
@@ -60,6 +60,7 @@ class State:
     view: View | None = None
     quality: str = "best"
     lighting: Lighting = Lighting()
+    background: Background = "white"
     maps: Mapping[str, Light] = field(default_factory=dict)
     light: Callable[[], Light | None] = lambda: None
 
@@ -74,9 +75,11 @@ class State:
         return self.lighting.light or (SUN_ALONE if self.lighting.sun else NAMES[0])
 
 
-def open_state(model: Model, cloud: PointCloud, name: str, lighting: Lighting) -> State:
+def open_state(
+    model: Model, cloud: PointCloud, name: str, lighting: Lighting, background: Background = "white"
+) -> State:
     """The initial state for a cloud; ValueError if it cannot be encoded, or if the light is no map."""
-    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting)
+    state = State(name=name, cloud=cloud, volume=model.encode(cloud), lighting=lighting, background=background)
     if lighting.light is None or lighting.light in NAMES:
         return relight(state, lighting) if changed_options(lighting) else state
     return add_map(state, display_name(Path(lighting.light).name), read_light(lighting.light))
@@ -124,7 +127,7 @@ def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
     named = qualities(model)
     quality: Quality
     quality, size = ("draft", named["draft"][1] // 2) if moving else named[state.quality]
-    behind = state.lighting.background
+    behind = state.background
     reach = square_reach(view, whole=behind != "white")
     camera, light = square_camera(view, state.volume, reach, size), state.light()
     rendering = model.render(state.volume, camera, quality, light)

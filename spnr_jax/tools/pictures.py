@@ -36,7 +36,7 @@ from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
-from spnr_jax.surfels.lighting import look_up_background
+from spnr_jax.surfels.lighting import look_up_background, room_light
 from spnr_jax.surfels.skies import sun
 from spnr_jax.tools.commands import Lighting, Render
 from spnr_jax.tools.surfaces import surface_depth
@@ -62,10 +62,10 @@ def check_takes_light(model: Model, names: Sequence[str], run: Path | None) -> N
 
 
 def put_background(wanted: str, rendering: Rendering, camera: Camera, light: Light | None) -> Rendering:
-    """The picture in front of its background: white, or the map of the light."""
-    if wanted == "white" or light is None:
+    """The picture in front of its background: white, or the map of the light (None: the room)."""
+    if wanted == "white":
         return rendering
-    behind = np.asarray(_draw_background(light, camera))
+    behind = np.asarray(_draw_background(light or room_light(), camera))
     image = np.asarray(rendering.image) + (1 - np.asarray(rendering.acc))[..., None] * (behind - 1)
     return dataclasses.replace(rendering, image=image)
 
@@ -165,7 +165,7 @@ def _draw(
     """Renderings of the views, one after the other, in front of their background."""
     renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
     for camera, light, rendering in zip(cameras, lights, renderings, strict=True):
-        yield put_background(options.lighting.background, rendering, camera, light)
+        yield put_background(options.background, rendering, camera, light)
 
 
 def _write_still(stem: str, rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> str:

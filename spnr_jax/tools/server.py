@@ -35,7 +35,7 @@ from spnr_jax.formats import clouds, images
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.methods import method_of
 from spnr_jax.tools import frame
-from spnr_jax.tools.commands import View, changed_options
+from spnr_jax.tools.commands import View
 from spnr_jax.tools.frame import State
 from spnr_jax.tools.pictures import check_takes_light
 from spnr_jax.training.weights import load
@@ -382,11 +382,12 @@ def open_viewer(command: View) -> tuple[Viewer, list[str]]:
     """The running viewer of a command, and the assumptions about its file; ValueError for a bad file."""
     _check_free(command.host, command.port)  # before the seconds that reading takes
     model = load(command.run)
-    check_takes_light(model, changed_options(command.lighting), command.run)
+    check_takes_light(model, command.light_options_given, command.run)
     notes: list[str] = []
     reading: dict[str, Any] = {"num_points": command.num_points, "up": command.up, "clean": command.clean}
     points = clouds.read_cloud(command.cloud, **reading, cut=command.cut, report=notes.append)
-    first = frame.open_state(model, points, frame.display_name(command.cloud.name), command.lighting)
+    name = frame.display_name(command.cloud.name)
+    first = frame.open_state(model, points, name, command.lighting, command.background)
     return Viewer(model, first, reading, command.host, command.port, command.reached_at), notes
 
 

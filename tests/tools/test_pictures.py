@@ -112,8 +112,8 @@ def test_a_transparent_still_has_an_alpha_channel_and_chosen_outputs_alone_are_w
 def test_the_light_changes_still_and_background_and_not_the_opacity_and_one_that_turns_every_frame(tmp_path):
     cloud, common = cloud_file(tmp_path), {"run": Path("surfels"), "quality": "draft", "views": 1, "frames": 3}
     rendered(cloud, tmp_path / "plain", **common, turntable="none")
-    lighting = Lighting(exposure=-1.0, background="light")
-    rendered(cloud, tmp_path / "lit", **common, turn="light", lighting=lighting)
+    lighting = Lighting(exposure=-1.0)
+    rendered(cloud, tmp_path / "lit", **common, turn="light", lighting=lighting, background="light")
     plain, lit = (shown(tmp_path / name / "chair_000.png").astype(int) for name in ("plain", "lit"))
     opacities = [(tmp_path / name / "chair_000_opacity.png").read_bytes() for name in ("plain", "lit")]
     assert lit[0, 0].min() < 250 < plain[0, 0].min()

@@ -116,7 +116,7 @@ def test_a_change_of_the_light_changes_the_picture():
 
 
 def test_the_map_stands_behind_the_object_on_the_whole_canvas_where_it_is_asked_for():
-    white, lit = (canvas(lighting=Lighting(light="sunset", background=b)) for b in ("white", "light"))
+    white, lit = (canvas(lighting=Lighting(light="sunset"), background=b) for b in ("white", "light"))
     assert (white[:4, :4] == 255).all()
     assert lit[:4, :4].mean() < 240
     assert lit[:, -4:].mean() < 240
