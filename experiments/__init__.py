@@ -2,4 +2,4 @@
 
 from spnr_jax.devices import runtime
 
-runtime.hide_false_alarms()  # here, because the modules of this folder import JAX
+runtime.hide_false_alarms()  # before the modules of this package import JAX

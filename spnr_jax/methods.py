@@ -110,7 +110,7 @@ METHODS: dict[str, Method] = {
 }
 
 
-# what files hold beside the fields of a config: one of earlier versions, and how a network's class is found
+# entries of files that are no fields of a config: one of earlier versions, and those that name a network's class
 EXTRA_FIELDS: dict[type, tuple[str, ...]] = {TrainConfig: ("trains",), NetworkConfig: ("method", "source")}
 
 

@@ -33,7 +33,7 @@ NAMED = 5  # files that an error message names
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """One object of a source: its mesh file, the folder that its files lie in (default: the mesh's own), its fault."""
+    """One object of a source: its mesh file, the folder of its files (default: the mesh's), why it cannot be used."""
 
     object_id: str
     path: Path

@@ -211,7 +211,7 @@ def plan_objects(config: GenerateConfig) -> list[Task]:
 
 
 def mesh_tasks(config: GenerateConfig, root: Path) -> list[Task]:
-    """The objects of the source that are files, in any order; paths are shown from its root: no private one is."""
+    """The objects of a source of files, in any order; paths are relative to its root: no private one is shown."""
     source, category = source_of(config)
     if source == "meshes":
         listed = [sources.Listed(object_id=name, path=path) for name, path in sources.find_meshes(root)]

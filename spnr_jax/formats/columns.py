@@ -11,7 +11,7 @@
     classification withheld         of laser scans
 
 and drops the others.  Colours are sRGB unless their name says linear.  Their range is 255 for 8-bit integers, else the
-smallest of 1, 100 (for fractions), 255, 1023, 4095 and 65535 that nearly all values lie below.
+smallest of 1, 100 (for fractions), 255, 1023, 4095 and 65535 that nearly no value exceeds.
 """
 
 import re

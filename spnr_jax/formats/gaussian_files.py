@@ -39,7 +39,7 @@ PACKED_BITS = {  # of a compressed .ply: property, first bit, number of bits
     **{"x": ("packed_position", 21, 11), "y": ("packed_position", 11, 10), "z": ("packed_position", 0, 11)},
     **{name: ("packed_color", 24 - 8 * i, 8) for i, name in enumerate((*SRGB, "splat_opacity"))},
 }
-COLOR_STEP = 0.15  # of .spz: a colour coefficient times COLOR_STEP has 255 steps
+COLOR_STEP = 0.15  # of .spz: octet = 255 (COLOR_STEP * coefficient + 0.5)
 CONVERT = "convert it to .ply, e.g. with SuperSplat (File > Export) or `splat-transform a.spz a.ply`"
 
 

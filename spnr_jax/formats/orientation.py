@@ -12,8 +12,8 @@ crowd    no panel at an end: share of the points within BASE of either end (the 
 72 of 78 real objects are found upright as they are, and 71 turned to z up (docs/lab/readers.md); `--up` overrides it.
 
 PCD headers and PLY camera elements may give the position of a sensor; normals are turned towards it, and a camera's
-axes give the up axis.  PCD writers put 0 0 0 if it is unknown: that is used only if it sees nearly all points, another
-position if it sees most of them.
+axes give the up axis.  PCD writers put 0 0 0 if it is unknown: this is used only if nearly all points are visible from
+it, another position if most are.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
-Text is separated by commas, semicolons, bars or blanks, with or without one at the end of a line.  A comma is a decimal
-one if something else separates the numbers, or inside quotes.  Lines of a single integer are counts of points.  A
+Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
+or if something else separates the numbers.  Lines of a single integer are counts of points.  A
 header line, also one after #, % or //, names the columns; columns without a name, and columns of words, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 

@@ -23,7 +23,7 @@ from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-OFF_HEAD = re.compile(r"\s*(?:(?:ST)?(C?)(N?)OFF(?=\d|\b))?\s*(?=\d+\s+\d+)")
+OFF_HEAD = re.compile(r"(?:(?:ST)?(C?)(N?)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
@@ -116,7 +116,7 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     """The part of an OFF file."""
     with open_text(path) as file:
         lines = re.sub(r"#.*", "", file.read()).splitlines()
-    text = "\n".join(line for line in lines if line.strip())
+    text = "\n".join(line for line in lines if line.strip()).lstrip()
     if (head := OFF_HEAD.match(text)) is None:
         raise UserError("is not an OFF file that can be read: expected OFF, COFF, NOFF or CNOFF in text, then counts")
     counts, *rows = text[head.end() :].split("\n")

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.cloud_arrays import find_distinct, unit_means, voxel_keys
+from spnr_jax.kernels.cloud_arrays import check_cloud_kind, find_distinct, unit_means, voxel_keys
 from spnr_jax.kernels.records import PointCloud
 
 Strength = Literal["auto", "strong"]
@@ -37,8 +37,9 @@ LEAST_POINTS = 100  # with fewer points, outliers cannot be told from the surfac
 NEIGHBORS = 8  # whose mean distance is a point's score
 SPARSE = 3.0  # times the median score: above it, the neighbours may be outliers themselves
 WIDE = 64  # neighbours considered in that case
-ROUND = 16, 0.05  # a point is in a volume if its 16 neighbours have this share of their variance along the normal
-MOST_ROUND = 0.1  # a sparse point in a volume is an outlier, unless more than this share of all points are in one
+# a point is in a volume if more than this share of the variance of its 16 neighbours is along their narrowest axis
+ROUND = 16, 0.05
+MOST_ROUND = 0.1  # sparse points in a volume are outliers, unless they are more than this share of all points
 UNLISTED = 0.6  # factor on the limit for a point that is not a neighbour of any other
 FEW, CHANCE = 4, 3e-4  # number and share of points that random sampling may isolate
 SURE = 2.0  # factor on the limit above which even these are outliers
@@ -90,6 +91,7 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
     """
     if strength not in NOISY:
         raise UserError(f"strength must be one of {', '.join(NOISY)}, got {strength!r}")
+    check_cloud_kind(cloud, "clean")
     if np.ndim(cloud.positions) != 2:
         raise UserError(f"clean takes one cloud, positions (points, 3); got shape {np.shape(cloud.positions)}")
     real = np.asarray(cloud.mask)

@@ -39,11 +39,16 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
     return jax.tree.map(extend, cloud)
 
 
-def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:
-    """ValueError, which names the function and the field, for a field that does not fit the mask (points,)."""
+def check_cloud_kind(cloud: Any, where: str) -> None:
+    """ValueError, which names the function, for what is no cloud."""
     if not isinstance(cloud, PointCloud):
         kind = type(cloud).__name__
         raise UserError(f"{where}: expected a PointCloud, as of read_cloud or make_cloud, got {kind}")
+
+
+def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:
+    """ValueError, which names the function and the field, for a field that does not fit the mask (points,)."""
+    check_cloud_kind(cloud, where)
     shape, kind = np.shape(cloud.mask), getattr(cloud.mask, "dtype", None) or np.asarray(cloud.mask).dtype
     if kind != np.bool_:
         raise UserError(f"{where}: cloud.mask is of type {kind}, expected bool")

@@ -5,6 +5,7 @@ points, rays, samples, height, width, features.  Colours of materials are linear
 sizes are static fields because they shape arrays.
 """
 
+import contextlib
 from typing import Any, no_type_check
 
 import jax
@@ -301,16 +302,24 @@ class Gaussians:
     harmonics: Float[AnyArray, "splats coefficients 3"]
 
 
-# `jax.export` then writes functions of them; static fields are whole numbers
-for record in (
-    PointCloud, Camera, Rays, Rendering, Scene, Volume, Surfels, SurfelScene, Light, GBuffer, Batch, Crops, Gaussians
-):  # fmt: skip
-    export.register_pytree_node_serialization(
-        record,
-        serialized_name=f"{record.__module__}.{record.__qualname__}",
-        serialize_auxdata=lambda sizes: " ".join(map(str, sizes)).encode(),
-        deserialize_auxdata=lambda written: tuple(map(int, bytes(written).split())),
-    )
+def register(record: type) -> None:
+    """Lets `jax.export` write functions of a record; static fields are integers."""
+    name = f"{record.__module__}.{record.__qualname__}"
+    with contextlib.suppress(ValueError):  # a module that is imported again: its first classes stay registered
+        if issubclass(record, tuple):
+            export.register_namedtuple_serialization(record, serialized_name=name)
+        else:
+            export.register_pytree_node_serialization(
+                record,
+                serialized_name=name,
+                serialize_auxdata=lambda sizes: " ".join(map(str, sizes)).encode(),
+                deserialize_auxdata=lambda written: tuple(map(int, bytes(written).split())),
+            )
+
+
+_RECORDS: tuple[type, ...] = (PointCloud, Camera, Rays, Rendering, Scene, Volume, Surfels, SurfelScene, Light, GBuffer)
+for _record in (*_RECORDS, Batch, Crops, Gaussians):
+    register(_record)
 
 Key = jax.Array
 

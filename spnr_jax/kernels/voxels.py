@@ -1,10 +1,10 @@
 """Points to volume and back (scatter to voxels, trilinear lookup), and empty-space skipping.
 
 A scatter is a sum: each point adds its features, over the number of points in its voxel, to the voxel
-(`mean_contributions`).  `gather_rows` and `scatter_rows` are each other's transpose.  vmap of either is a single gather
-or scatter in a table with the rows of all batch elements end to end: on a CPU, XLA's batched scatter is a loop that is
-about four times slower (32^3 voxels, 2 objects).  On a device mesh there is one such table per device; in a common one
-XLA could not know that rows stay on their device.
+(`mean_contributions`).  `gather_rows` and `scatter_rows` are each other's transpose.  Under vmap, either is one
+gather or scatter in the concatenated tables of all batch elements, because XLA's batched scatter on a CPU is a loop,
+about four times slower (32^3 voxels, 2 objects).  On a device mesh each group of objects has its own table, else XLA
+could not know that rows stay on their device.
 
 A volume covers the box [-1, 1]^3 with D voxels along each axis and is indexed (z, y, x, features); voxel i of an axis
 covers [-1 + 2 i / D, -1 + 2 (i + 1) / D].  Positions are (x, y, z).  In grid coordinates, (position + 1) * D / 2, voxel

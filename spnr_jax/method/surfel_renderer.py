@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.devices.programs import CachedProgram
@@ -36,6 +35,7 @@ from spnr_jax.kernels.records import (
     SurfelScene,
     check_camera_kind,
     check_light,
+    register,
     unstack,
 )
 from spnr_jax.nn import shader
@@ -86,7 +86,7 @@ class Sizes(NamedTuple):
     slots: Any
 
 
-export.register_namedtuple_serialization(Sizes, serialized_name=f"{__name__}.Sizes")
+register(Sizes)
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
@@ -95,8 +95,9 @@ export.register_namedtuple_serialization(Sizes, serialized_name=f"{__name__}.Siz
 def plan(scene: SurfelScene, camera: Camera) -> Plan:
     """Sizes that suffice for every view of a camera or a batch of cameras, and one scene or a stack of scenes.
 
-    Runs on the host, because array sizes cannot be traced.  For a stack of scenes (*scenes), cameras are (*scenes,
-    *views), or one camera for all.  ValueError if a picture needs more entries than can be sorted.
+    Runs on the host, because array sizes cannot be traced.  For a stack of scenes with axes (*scenes),
+    cameras have the axes (*scenes, *views), or none: one camera for all.  ValueError if a picture needs more entries
+    than can be sorted.
     """
     _check_scene(scene, "plan")
     cloud_arrays.refuse_tracers(scene, "plan")
@@ -119,6 +120,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
 
 def check_camera(camera: Camera, where: str) -> None:
     """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
+    check_camera_kind(camera)
     cloud_arrays.refuse_tracers(camera, where)
     tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
     if tails != [(3, 4), (3, 3)]:
@@ -262,7 +264,7 @@ class WindowBuffer(NamedTuple):
     overflow: Int[Array, ""]
 
 
-export.register_namedtuple_serialization(WindowBuffer, serialized_name=f"{__name__}.WindowBuffer")
+register(WindowBuffer)
 
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:

@@ -5,8 +5,8 @@ dynamic range) compares what the eye resolves at PIXELS_PER_DEGREE, by the packa
 al. 2018, version 0.1, AlexNet) compares features of a trained network; it is measured where the package `lpips` is
 installed and finds its weights.  Both are 0 for the same picture.
 
-Scores are an array (views,) for each object; a NaN is a view without a score and is left out; None: no number.
-Intervals are those of the mean over views, by a cluster bootstrap over objects (views of one object are not
+Scores are an array (views,) for each object; a NaN is a view without a score and is left out; None stands for a missing
+number.  Intervals are those of the mean over views, by a cluster bootstrap over objects (views of one object are not
 independent): percentile intervals at an expanded level that is exact for means of normal scores (Hesterberg 2015), none
 below FEWEST_OBJECTS.  Differences are paired by view; their p-value is that of a sign-flip test over objects.  Objects
 are sorted first, so their order does not matter.

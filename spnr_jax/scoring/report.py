@@ -1,8 +1,8 @@
 """An evaluation as files: metrics.json for programs, report.html for people.
 
 The report is one file that holds everything, to open from disk, to mail, to keep: key numbers and summary, which
-objects are scored, their pictures, quality beside the trivial, settings.  Images are PNGs inside the page (report.html
-is its template); nothing is loaded from elsewhere, and no script runs.
+objects are scored, their pictures, quality beside the trivial renderers, settings.  Images are PNGs inside the page
+(report.html is its template); nothing is loaded from elsewhere, and no script runs.
 """
 
 import json

@@ -96,7 +96,7 @@ def bridge_gaps(uv: Float[Array, "k 2 block"], membership: Float[Array, "k block
     diagram in the tangent plane.  The largest empty circle through the point with its center in direction d has the
     curvature k(d) = max_j d . y_j, with the inversions y_j = 2 p_j / |p_j|^2 of the neighbors.  k has a local minimum
     at a Voronoi vertex, and is at most 0 where the layer ends.  The factor is max(1, radius / gap_cover) of the largest
-    gap.
+    gap whose radius is below widest_gap.
     """
     half = (uv[:, 0] ** 2 + uv[:, 1] ** 2) / 2
     other = (membership > 0.5) & (half > CONSTANTS.duplicate_distance)

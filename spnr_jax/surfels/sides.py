@@ -2,9 +2,9 @@
 
 For each of 64 directions, the points are drawn into an orthographic depth buffer whose cells are CELL spacings wide:
 each point into the four cells around it, at the depth of its plane at the cell's centre.  A point is lifted off the
-surface by its spacing h; its visibility is then clip(1 - (buffer - depth) / h, 0, 1).  Both depths are taken at the
-cell's centre, so a plane does not hide itself at any angle.  Visibility also gives ambient occlusion and the share of
-light that arrives.
+surface by its spacing h; with the depth of the lifted point, measured towards the viewer, its visibility is
+clip(1 - (buffer - depth) / h, 0, 1).  Both depths are taken at the cell's centre, so a plane does not hide itself at
+any angle.  Visibility also gives ambient occlusion and the share of light that arrives.
 
 Votes are pure functions of a block of points, the last axis.  A vote is positive if the normal points outward.  Votes
 flip a normal or keep it, and have no gradient.

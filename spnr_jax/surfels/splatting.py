@@ -2,10 +2,10 @@
 
     entry         a pair of a disc and a pixel that it covers (gsplat: intersection); entries are counted, made, and
                   sorted by pixel and depth
-    kernel        k = clip(max(c - r^2, 1 - p^2), 0, 1): r is the distance from the disc's centre in its plane, over
-                  RADIUS spacings; c falls from 1 to 0 at the disc's rims; p is the distance from the projected centre,
-                  over MIN_RADIUS pixels (low-pass filter of EWA splatting, Zwicker et al. 2001).  The optical depth of
-                  an entry is CENTRE_TAU k^2
+    kernel        k = clip(max(c - r^2, RIM_SKIRT (1 - r^2), 1 - p^2), 0, 1): r is the distance from the disc's centre
+                  in its plane, over RADIUS spacings; c falls from 1 to 0 at the disc's rims; p is the distance from the
+                  projected centre, over MIN_RADIUS pixels (low-pass filter of EWA splatting, Zwicker et al. 2001).  An
+                  entry whose facing is f (0 for a hidden back face) has the optical depth CENTRE_TAU k^2 f
     groups        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
                   occlude each other; from two spacings on, the front entry occludes the one behind
     blend weight  of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the

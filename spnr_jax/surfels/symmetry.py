@@ -40,7 +40,7 @@ UNLIKE = 0.15  # difference of square roots of colors, beyond which a reflected 
 
 
 class Limits(NamedTuple):
-    """Limits of distances, in spacings, from a reflected point to the nearest measured one."""
+    """Limits for reflected points; distances, in spacings, are those to the nearest measured point."""
 
     fits: float
     """A neighborhood fits if its mean distance is below this."""

@@ -25,10 +25,10 @@ def changed_options(options: Any) -> tuple[str, ...]:
     return tuple(f"--{name.replace('_', '-')}" for name in changed)
 
 
-def require_drawable(pixels: int | None) -> None:
+def require_drawable(pixels: int | None, name: str = "--resolution") -> None:
     """UserError for a number of pixels along a side that is not drawn."""
     if pixels is not None and not (16 <= pixels <= MOST_PIXELS and pixels % 4 == 0):
-        raise UserError(f"--resolution must be a multiple of 4 from 16 to {MOST_PIXELS}, got {pixels}")
+        raise UserError(f"{name} must be a multiple of 4 from 16 to {MOST_PIXELS}, got {pixels}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class SplatOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class CloudOptions:
-    """A file of points or a mesh, how it is read, and what draws it in which light."""
+    """A file of points or a mesh, how it is read, and the network and light that draw it."""
 
     cloud: tyro.conf.Positional[Path]
     """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj

@@ -219,7 +219,7 @@ def export_render(
     """
     _check_exportable(model)
     size = model.config.image_resolution if resolution is None else resolution
-    require_drawable(size)
+    require_drawable(size, "resolution")
     if quality == "balanced":
         raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
     params = None if quality == "draft" else model.params

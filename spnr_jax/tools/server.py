@@ -163,7 +163,7 @@ LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 WIDEST_EXPOSURE = 4.0  # stops
 PATIENCE = 1.0  # seconds of drawing after which the page says why it waits
-PREPARING = "Drawing. For a picture of a new size, programs are compiled first, once."
+PREPARING = "Drawing. The first picture of a new size takes longer: its programs are compiled."
 ONE_LIGHT = "This network knows the light of its training alone; `--run surfels` draws in any."
 
 
@@ -178,7 +178,7 @@ class Browser:
         self.loop = Loop(first, lambda state, moving: self._try(lambda: self._draw(state, moving)))
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
-        self._status = gui.add_markdown(PREPARING)
+        self._status = gui.add_markdown("")
         with gui.add_folder("Picture"):
             self._add_picture(gui)
         with gui.add_folder("Light"):
@@ -199,17 +199,35 @@ class Browser:
             self._replace(view=view)
 
     def _draw(self, state: State, moving: bool) -> None:
-        waiting = threading.Timer(PATIENCE, lambda: setattr(self._status, "content", PREPARING))
-        waiting.start()
-        try:
-            with self._network:
-                canvas = frame.draw(self._model, state, moving)
-        finally:
-            waiting.cancel()
+        with self._explain_wait(), self._network:
+            canvas = frame.draw(self._model, state, moving)
         if canvas is not None and not self.loop.stopped and (moving or not self.loop.is_superseded):
             quality = MOVING_JPEG if moving else RESTING_JPEG
             self._client.scene.set_background_image(canvas, format="jpeg", jpeg_quality=quality)
-            self._status.content = ""
+
+    @contextlib.contextmanager
+    def _explain_wait(self) -> Iterator[None]:
+        """Says on the page why a picture takes longer than PATIENCE, until it is drawn."""
+        lock, drawing = threading.Lock(), True
+
+        def say(text: str) -> None:
+            if not self.loop.stopped and self._status.content != text:
+                self._status.content = text
+
+        def tell() -> None:
+            with lock:  # a timer that has fired cannot be cancelled
+                say(PREPARING if drawing else "")
+
+        waiting = threading.Timer(PATIENCE, tell)
+        waiting.daemon = True
+        waiting.start()
+        try:
+            yield
+        finally:
+            waiting.cancel()
+            with lock:
+                drawing = False
+                say("")
 
     def _replace(self, **fields: Any) -> None:
         self.loop.submit(lambda state: dataclasses.replace(state, **fields))

@@ -513,6 +513,7 @@ REFUSED = [
     ("digits.txt", "1;2;3\n" + "9" * 200_000 + "x;2;3\n", "line 2"),
     ("more digits.xyz", "1.5 2 " + 4000 * "9" + "\n1 2 x\n", "expected 3 numbers"),
     ("brackets.txt", "x;y;z;" + "(" * 200_000 + "\n1;2;3\n", "above 3 columns"),
+    ("blanks.off", 200_000 * " " + "x", "not an OFF file that can be read"),
     ("empty lines.obj", "\n" * 200_000 + "v 1 2 3\n", "1 place"),
 ]
 

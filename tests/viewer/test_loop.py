@@ -1,11 +1,15 @@
 """The thread that draws: changes in order, at once and once more at rest."""
 
+import contextlib
 import threading
+import time
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed: pip install 'spnr-jax[viewer]'")
 
+from spnr_jax.tools import server  # noqa: E402
 from spnr_jax.tools.server import Loop  # noqa: E402
 
 
@@ -50,3 +54,18 @@ def test_changes_that_come_while_a_picture_is_drawn_wait_together_and_supersede_
     loop.join(10.0)
     assert drawn == [0, 3]
     assert seen == [True]
+
+
+@pytest.mark.parametrize("error", [None, KeyError])
+def test_the_page_says_why_a_picture_takes_long_until_it_is_drawn_or_fails(monkeypatch, error):
+    monkeypatch.setattr(server, "PATIENCE", 0.01)
+    page = SimpleNamespace(loop=SimpleNamespace(stopped=False), _status=SimpleNamespace(content=""))
+    fails = pytest.raises(error) if error else contextlib.nullcontext()
+    with fails, server.Browser._explain_wait(page):
+        end = time.monotonic() + 10
+        while page._status.content != server.PREPARING:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        if error:
+            raise error
+    assert page._status.content == ""
