@@ -10,8 +10,11 @@ import pytest
 from support import twin
 
 from experiments.speed.bench import make_batch
-from spnr_jax.kernels import losses
+from spnr_jax.config import AS_TRAINED
+from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference
+from spnr_jax.method.paper_method import render_rays
+from spnr_jax.nn.paper_layers import encode_direction
 from spnr_jax.training import optimisation
 
 TOLERANCE = 1e-4
@@ -37,30 +40,70 @@ def pictures(key):
 
 @pytest.fixture(scope="module")
 def stages():
-    """The generator in evaluation: results under their names in the fixture and in its layout."""
+    """Every intermediate result of the generator in evaluation under its name in the fixture, from one program."""
 
     @jax.jit
     def run(variables, cloud, camera):
         module = inference.network(CONFIG.model).bind(variables)
+        resolution, counts = CONFIG.model.encoder.volume_resolution, CONFIG.model.sampling
+        point_features = module.encoder.point_features(cloud)
         scene = module.encode(cloud)
-        return module.encoder.point_features(cloud)[0], scene.volume, module.render(scene, camera)
+        rays = module.rays(camera)
+        near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
+        objects = jnp.zeros(rays.origins.shape[:-1], jnp.int32)
+        coarse, edges = sampling.stratified(None, near, far, counts.num_coarse)
+        positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
+        density, (rgb, _) = module.make_field(scene, rays, objects)[0](coarse)
+        weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
+        features, depth, acc = render_rays(module, scene, rays, counts, AS_TRAINED, None)
+        cell, offset = voxels.locate(cloud.positions, resolution)
+        grid, occupancy = voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution)
+        rendering = module.render(scene, camera)
+        encoding = encode_direction(rays.directions, CONFIG.model.direction_frequencies)
 
-    point_features, volume, rendering = run(VARIABLES, BATCH.cloud, BATCH.camera)
-    acc, depth = visible(rendering)
-    views = {"rgb": rendering.image_lr[:, 0], "acc": acc, "depth": depth, "image": rendering.image[:, 0]}
-    channels_last = {"volume": volume, **views}
-    return {"point_features": point_features} | {name: np.moveaxis(x, -1, 1) for name, x in channels_last.items()}
+        def as_picture(x):  # (1, c, h, w), as the twin has it
+            return jnp.moveaxis(x.reshape(1, 32, 32, -1), -1, 1)
+
+        return {
+            "voxel_index": (cell[0, :, 2] * resolution + cell[0, :, 1]) * resolution + cell[0, :, 0],
+            "voxel_offset": offset,
+            "point_features": point_features[0],
+            "grid": jnp.moveaxis(jnp.concatenate([grid, occupancy[..., None]], axis=-1), -1, 1),
+            "volume": jnp.moveaxis(scene.volume, -1, 1),
+            "ray_direction": rays.directions,
+            "near": near[..., None],
+            "far": far[..., None],
+            "direction_encoding": encoding.reshape(1, 32, 32, -1)[:, :, 0],
+            "coarse_t": coarse,
+            "coarse_lookup_row0": voxels.trilinear(scene.volume, jnp.clip(positions, -1, 1))[:, :32],  # the twin clamps
+            "coarse_density": density,
+            "coarse_rgb_row0": rgb[:, :32],
+            "coarse_weights": weights,
+            "fine_t": sampling.importance(None, edges, weights, counts.num_fine, counts.padding),
+            "features": as_picture(features),
+            "rgb": as_picture(rendering.image_lr),
+            "acc": as_picture(acc),
+            "depth": as_picture(depth - (1 - acc) * far),  # ours adds the light that nothing stops, at `far`
+            "image": jnp.moveaxis(rendering.image[:, 0], -1, 1),
+        }
+
+    return run(VARIABLES, BATCH.cloud, BATCH.camera)
 
 
-def visible(rendering):
-    """Opacity and depth of the view as the twin has them: ours adds the light that nothing stops, at `far`."""
-    acc, depth = (np.asarray(x)[:, 0, ..., None] for x in (rendering.acc, rendering.depth))
-    return acc, depth - (1 - acc) * ARRAYS["eval/far"].reshape(1, 32, 32, 1)
+STAGES = (
+    *("voxel_offset", "point_features", "grid", "volume", "ray_direction", "near", "far", "direction_encoding"),
+    *("coarse_t", "coarse_lookup_row0", "coarse_density", "coarse_rgb_row0", "coarse_weights", "fine_t"),
+    *("features", "rgb", "acc", "depth", "image"),
+)
 
 
-@pytest.mark.parametrize("name", ["point_features", "volume", "rgb", "acc", "depth", "image"])
+@pytest.mark.parametrize("name", STAGES)
 def test_every_stage_of_the_generator_is_the_twins(stages, name):
     agree(stages[name], ARRAYS[f"eval/{name}"].reshape(stages[name].shape))
+
+
+def test_points_lie_in_the_same_voxels(stages):
+    np.testing.assert_array_equal(stages["voxel_index"], ARRAYS["eval/voxel_index"])
 
 
 @pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
@@ -104,8 +147,10 @@ def test_images_losses_and_statistics_of_the_training(trained):
     rendering, statistics, losses_of, _ = trained
     agree(rendering.image[:, 0], pictures("train/image"))
     agree(rendering.image_lr[:, 0], pictures("train/rgb"))
-    for name, ours in zip(("acc", "depth"), visible(rendering), strict=True):
-        agree(ours, pictures(f"train/{name}"))
+    far = ARRAYS["eval/far"].reshape(1, 32, 32, 1)
+    acc, depth = (np.asarray(x)[:, 0, ..., None] for x in (rendering.acc, rendering.depth))
+    agree(acc, pictures("train/acc"))
+    agree(depth - (1 - acc) * far, pictures("train/depth"))
     for name in ("l1", "adv", "loss_g"):
         agree(losses_of[name], ARRAYS[f"train/{name}"])
     for layer in range(3):
@@ -120,19 +165,52 @@ def test_gradients_of_every_parameter(trained):
         {name.removeprefix(begin): x for name, x in ARRAYS.items() if name.startswith(begin)}
         for begin in ("train/grad_norm/gen.", "train/grad/gen.")
     )
-    ours = twin_named(lambda named: twin.generator(named)[0], "param/gen.", trained[3])
-    assert set(norms) == {name for name in ours if "running" not in name}
+    ours = twin_named(trained[3])
+    assert set(ours) == set(norms)
     for name, norm in norms.items():
         agree(np.linalg.norm(ours[name]), norm)
     for name, gradient in stored.items():
         agree(ours[name], gradient)
 
 
-def twin_named(convert, prefix, gradients):
-    """Gradients under the twin's names and in its layout: through the conversion of its weights to ours."""
-    named = {name: jnp.asarray(x) for name, x in ARRAYS.items() if name.startswith(prefix)}
-    (found,) = jax.vjp(convert, named)[1](gradients)
-    return {name.removeprefix(prefix): np.asarray(x) for name, x in found.items()}
+def twin_named(tree):
+    """Gradients under the twin's names and in its layout."""
+
+    def conv(x):
+        return np.moveaxis(np.asarray(x), (-1, -2), (0, 1))
+
+    points, unet, upsampler = tree["encoder"]["pointnet"], tree["encoder"]["unet"], tree["upsampler"]
+    named = {"points.out.weight": points["out"]["kernel"].T, "points.out.bias": points["out"]["bias"]}
+    for i in range(3):
+        named[f"points.linears.{i}.weight"] = points[f"hidden_{i}"]["kernel"].T
+        named |= {
+            f"points.norms.{i}.weight": points[f"norm_{i}"]["scale"],
+            f"points.norms.{i}.bias": points[f"norm_{i}"]["bias"],
+        }
+    for name, block in unet.items():
+        prefix = "unet." + name.replace("_", ".")
+        named |= {f"{prefix}.conv.weight": conv(block["kernel"])}
+        named |= {f"{prefix}.norm.weight": block["norm"]["scale"], f"{prefix}.norm.bias": block["norm"]["bias"]}
+    for i in range(4):
+        named |= {
+            f"upsampler.conv{i}.weight": conv(upsampler[f"kernel_{i}"]),
+            f"upsampler.conv{i}.bias": upsampler[f"bias_{i}"],
+        }
+    return named | twin_named_field(tree["field"])
+
+
+def twin_named_field(field):
+    """Ours keeps density and RGB in one matrix, and the rows of hidden layer and direction in two."""
+    head, bias = field["head"]["kernel"], field["head"]["bias"]
+    hidden = np.concatenate([head[:, 1:], field["features"]["kernel"]], axis=1)
+    return {
+        "renderer.field.hidden.weight": field["hidden"]["kernel"].T,
+        "renderer.field.hidden.bias": field["hidden"]["bias"],
+        "renderer.field.density.weight": head[:, :1].T,
+        "renderer.field.density.bias": bias[:1],
+        "renderer.field.feature.weight": np.concatenate([hidden, field["direction"]["kernel"]]).T,
+        "renderer.field.feature.bias": np.concatenate([bias[1:], field["feature_bias"]]),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +235,12 @@ def test_losses_and_gradient_norms_of_the_discriminator(discriminated, name, key
     agree(discriminated[name][0], ARRAYS[f"train/{name}"])
     stored = {k.split("disc.")[1]: v for k, v in ARRAYS.items() if k.startswith(f"train/{key}/disc.")}
     assert len(stored) == 13
-    ours = twin_named(twin.discriminator, "param/disc.", discriminated[name][1])
     for parameter, norm in stored.items():
-        agree(np.linalg.norm(ours[parameter]), norm)
+        agree(np.linalg.norm(parameter_of(discriminated[name][1], parameter)), norm)
+
+
+def parameter_of(tree, name):
+    kind, i, what = name.split(".")
+    if kind == "convs":
+        return tree[f"{'kernel' if what == 'weight' else 'bias'}_{i}"]
+    return tree[f"norm_{i}"]["scale" if what == "weight" else "bias"]
