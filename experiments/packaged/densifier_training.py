@@ -34,7 +34,8 @@ from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.method.densifier import CANDIDATES, Candidates, Nodes, build_graph, init, predict, rotate, weigh_rows
 from spnr_jax.surfels import geometry, sides, symmetry
-from spnr_jax.surfels.geometry import PointColumns, order_in_space
+from spnr_jax.surfels.geometry import PointColumns
+from spnr_jax.surfels.neighbors import order_in_space
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine

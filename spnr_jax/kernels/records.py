@@ -42,7 +42,7 @@ class PointCloud:
     So the two kinds stay apart for the network: 0.5 is the surest learned point, 1 the least sure one.
     """
     evenness: Float[AnyArray, "*batch points"] | None = None
-    """Evenness of the measured points (`surfels.geometry.measure_evenness`); None: that of these points.
+    """Evenness of the measured points (`surfels.neighbors.measure_evenness`); None: that of these points.
 
     One number for the cloud, repeated for each point so that it is batched and padded like the other fields.
     """

@@ -24,7 +24,8 @@ from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp, length, normalize, safe_sqrt
 from spnr_jax.kernels.records import AnyArray, Key, PointCloud
 from spnr_jax.kernels.voxels import map_existing
-from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, measure_evenness, normalise_cloud
+from spnr_jax.surfels.geometry import check_inputs, estimate_surfels, normalise_cloud
+from spnr_jax.surfels.neighbors import measure_evenness
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points
 SPARSE = 8192  # points of a cloud up to which points are added everywhere; larger ones: rims, curves, thin walls

@@ -26,8 +26,9 @@ from spnr_jax.method.surfel_renderer import Resolution, Sizes
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
-from spnr_jax.surfels.geometry import make_scene, neighbors, order_in_space
+from spnr_jax.surfels.geometry import make_scene
 from spnr_jax.surfels.lighting import room_light
+from spnr_jax.surfels.neighbors import neighbors, order_in_space
 
 BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab/performance.md
 

@@ -16,7 +16,8 @@ from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cleaning import Cleaned
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.surfels import geometry
-from spnr_jax.surfels.geometry import PointColumns, order_in_space
+from spnr_jax.surfels.geometry import PointColumns
+from spnr_jax.surfels.neighbors import order_in_space
 
 NEIGHBORS = 16  # of a point, for the spacing
 REACH = 2.0  # times the larger of spacing and noise: standard deviation of a neighbour's weight by distance

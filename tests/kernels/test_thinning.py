@@ -14,8 +14,8 @@ from spnr_jax.kernels.cloud_arrays import (
     sample_stream,
     stack_columns,
 )
-from spnr_jax.surfels.geometry import measure_evenness, neighbors
 from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.neighbors import measure_evenness, neighbors
 
 
 @pytest.mark.parametrize("num_points", [500, 6000])  # 6000 is thinned at random before

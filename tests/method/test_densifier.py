@@ -15,7 +15,8 @@ import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.method import densifier, surfel_method
 from spnr_jax.method.densifier import CANDIDATES, Nodes, place_candidates
-from spnr_jax.surfels import geometry, symmetry
+from spnr_jax.surfels import symmetry
+from spnr_jax.surfels.neighbors import measure_evenness
 from spnr_jax.training import weights
 
 COUNT, SIZE = 150, 512  # real points, and with padding; whole clouds have as many, so that they share programs
@@ -49,7 +50,7 @@ def test_measured_points_are_kept_as_they_are_and_learned_points_are_told(params
     close(np.linalg.norm(np.asarray(dense.normals)[np.asarray(dense.mask)], axis=1), 1, atol=1e-5)
     told = points.replace(learned=np.full(SIZE, 0.7, np.float32))
     np.testing.assert_array_equal(run(params, told, spnr_jax.neighbors(points)).learned[:SIZE], told.learned)
-    evenness = geometry.measure_evenness(points, spnr_jax.neighbors(points))
+    evenness = measure_evenness(points, spnr_jax.neighbors(points))
     close(dense.evenness, np.full(len(dense.mask), evenness), rtol=1e-4)
 
 

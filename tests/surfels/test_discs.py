@@ -8,8 +8,8 @@ from scipy.spatial import Delaunay
 from support.surfel_clouds import cloud, estimate, even_square, shape
 
 from spnr_jax.surfels import discs
-from spnr_jax.surfels.geometry import neighbors
 from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.neighbors import neighbors
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1
 RED, BLUE = np.array([0.7, 0.1, 0.1]), np.array([0.1, 0.2, 0.6])

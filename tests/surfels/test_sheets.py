@@ -7,7 +7,7 @@ from support.surfel_clouds import cloud, estimate
 
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.surfels import geometry, normals
-from spnr_jax.surfels.geometry import neighbors
+from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.sides import spiral
 
 COUNT = 2000  # points of a skin

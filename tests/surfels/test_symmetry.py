@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.cloud_arrays import farthest_points, pad
-from spnr_jax.surfels import geometry, symmetry
+from spnr_jax.surfels import symmetry
+from spnr_jax.surfels.neighbors import measure_evenness, neighbors
 from tests.support.laws import close
 from tests.support.surfel_clouds import cloud
 
@@ -52,7 +53,7 @@ def surface_of(one) -> symmetry.Surface:
 
 
 def evenness_of(one) -> float:
-    return float(geometry.measure_evenness(one, geometry.neighbors(one)))
+    return float(measure_evenness(one, neighbors(one)))
 
 
 def stays_as_it_is(one) -> bool:
@@ -72,7 +73,7 @@ def test_the_evenness_is_that_of_the_program_in_any_units_and_kept_beside_added_
     assert abs(found - expected) < 0.05
     for scale in (1e-4, 1.0, 1e4):
         padded = pad(dataclasses.replace(one, positions=scale * one.positions), 1024)
-        close(geometry.measure_evenness(padded, jnp.asarray(geometry.neighbors(padded))), found, rtol=1e-4)
+        close(measure_evenness(padded, jnp.asarray(neighbors(padded))), found, rtol=1e-4)
     more = symmetry.complete(one)
     assert len(more.mask) > len(one.mask)
     close(evenness_of(more), found)
