@@ -11,6 +11,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from types import UnionType
 from typing import Any
 
 JSON = (dict, list, str, int, float, bool, type(None))
@@ -58,6 +59,12 @@ def is_bug(error: Exception) -> bool:
 def first_line(error: Exception) -> str:
     """First line of an error message (libraries may append call stacks); the type if there is no message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
+def check_kind(value: Any, kind: type | UnionType, expected: str) -> None:
+    """UserError, "EXPECTED, got TYPE", unless the value is of a kind."""
+    if not isinstance(value, kind):
+        raise UserError(f"{expected}, got {type(value).__name__}")
 
 
 @contextlib.contextmanager

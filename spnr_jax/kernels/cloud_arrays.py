@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
 
@@ -41,9 +41,7 @@ def pad(cloud: PointCloud, size: int) -> PointCloud:
 
 def check_cloud_kind(cloud: Any, where: str) -> None:
     """ValueError, which names the function, for what is no cloud."""
-    if not isinstance(cloud, PointCloud):
-        kind = type(cloud).__name__
-        raise UserError(f"{where}: expected a PointCloud, as of read_cloud or make_cloud, got {kind}")
+    check_kind(cloud, PointCloud, f"{where}: expected a PointCloud, as of read_cloud or make_cloud")
 
 
 def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None:

@@ -14,7 +14,7 @@ from flax import struct
 from jax import export
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
@@ -212,16 +212,12 @@ class Light:
 
 def check_camera_kind(camera: Any) -> None:
     """ValueError unless it is a camera, or a batch of cameras in one record."""
-    if not isinstance(camera, Camera):
-        kind = type(camera).__name__
-        raise UserError(f"camera: expected a Camera, as of model.camera or cameras.pinhole, got {kind}")
+    check_kind(camera, Camera, "camera: expected a Camera, as of model.camera or cameras.pinhole")
 
 
 def check_light(light: Light | None) -> None:
     """ValueError unless it is one light, or None."""
-    if light is not None and not isinstance(light, Light):
-        kind = type(light).__name__
-        raise UserError(f"light: expected a Light, as spnr_jax.read_light('studio') or light_of(map), got {kind}")
+    check_kind(light, Light | None, "light: expected a Light, as spnr_jax.read_light('studio') or light_of(map)")
     if light is not None and np.shape(light.tables) != TABLES:
         raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 

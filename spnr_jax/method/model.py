@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spnr_jax.config import NetworkConfig, Quality
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.records import (
     Camera,
@@ -111,8 +111,7 @@ class Model:
         """
         if quality not in get_args(Quality):
             raise UserError(f"quality must be one of {', '.join(get_args(Quality))}, got {quality}")
-        if not isinstance(volume, Volume):
-            raise UserError(f"render: expected a volume of Model.encode, got {type(volume).__name__}")
+        check_kind(volume, Volume, "render: expected a volume of Model.encode")
         lights = lights or [None] * len(views)
         for light in lights:
             check_light(light)
@@ -130,9 +129,7 @@ class Model:
 
         Pure: angles and volume may be traced.
         """
-        if not isinstance(volume, Volume | SurfelScene):
-            kind = type(volume).__name__
-            raise UserError(f"camera: expected what Model.encode or spnr_jax.encode returns, got {kind}")
+        check_kind(volume, Volume | SurfelScene, "camera: expected what Model.encode or spnr_jax.encode returns")
         size = self.config.image_resolution if resolution is None else resolution
         if not isinstance(size, int | np.integer) or size < 1:
             raise UserError(f"camera: resolution={size} is no number of pixels; `cameras.resize` makes other shapes")

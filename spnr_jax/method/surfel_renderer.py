@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.devices.programs import CachedProgram
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
 from spnr_jax.kernels.numerics import larger
@@ -244,16 +244,14 @@ def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light
         raise UserError(f"render: expected params=model.params, or None; got a dict of {', '.join(params)}")
     if any(isinstance(size, jax.core.Tracer) for size in jax.tree.leaves(plan)):
         raise UserError("render: plan is traced, but gives array sizes: jax.jit(render, static_argnames='plan')")
-    if not isinstance(plan, Plan):
-        raise UserError(f"render: expected plan=spnr_jax.plan(scene, camera), got {type(plan).__name__}")
+    check_kind(plan, Plan, "render: expected plan=spnr_jax.plan(scene, camera)")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
 
 
 def _check_scene(scene: SurfelScene, where: str) -> None:
     """ValueError unless it is a scene."""
-    if not isinstance(scene, SurfelScene):
-        raise UserError(f"{where}: expected a scene of spnr_jax.encode, or volume.scene, got {type(scene).__name__}")
+    check_kind(scene, SurfelScene, f"{where}: expected a scene of spnr_jax.encode, or volume.scene")
 
 
 class WindowBuffer(NamedTuple):

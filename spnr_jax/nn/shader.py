@@ -58,6 +58,9 @@ OUTPUTS = {  # of the network; `compose_picture` has the formulas
     **{"bounced_constant": 3, "bounced_bands": 8, "metallic_step": 1, "rougher": 1},
 }
 NUM_FEATURES, NUM_OUTPUTS = sum(INPUTS.values()), sum(OUTPUTS.values())
+FIRST = dict(zip(INPUTS, np.cumsum([0, *INPUTS.values()]).tolist(), strict=False))  # index of each input
+# indices of the inputs that change their sign when the picture is mirrored along x, or along y
+ODD = tuple(tuple(FIRST[name] + axis for name in ("normal", "bent_normal", "centre_offset")) for axis in (0, 1))
 
 
 def stack_channels(values: dict[str, Array], channels: dict[str, int]) -> Float[Array, "*batch channels"]:
@@ -66,16 +69,12 @@ def stack_channels(values: dict[str, Array], channels: dict[str, int]) -> Float[
     return jnp.concatenate([values[x][..., None] if n == 1 else values[x] for x, n in channels.items()], axis=-1)
 
 
-def split_channels(stacked: Float[Array, "*batch channels"], channels: dict[str, int]) -> dict[str, Array]:
-    """The inverse of `stack_channels`."""
-    parts = jnp.split(stacked, np.cumsum([*channels.values()])[:-1], axis=-1)
-    return {x: part[..., 0] if n == 1 else part for (x, n), part in zip(channels.items(), parts, strict=True)}
-
-
-def find_odd_inputs(axis: int) -> list[int]:
-    """Indices of the inputs that change their sign when the picture is mirrored along x (0) or y (1)."""
-    first = dict(zip(INPUTS, np.cumsum([0, *INPUTS.values()]).tolist(), strict=False))
-    return [first[name] + axis for name in ("normal", "bent_normal", "centre_offset")]
+def split_channels(
+    stacked: Float[Array, "*batch channels"], channels: dict[str, int], *, keep_axis: bool = False
+) -> dict[str, Array]:
+    """The inverse of `stack_channels`; with `keep_axis`, single channels keep their axis."""
+    parts = zip(channels.items(), jnp.split(stacked, np.cumsum([*channels.values()])[:-1], axis=-1), strict=True)
+    return {name: part[..., 0] if count == 1 and not keep_axis else part for (name, count), part in parts}
 
 
 # --- inputs -----------------------------------------------------------------------------------------------------------
@@ -280,21 +279,17 @@ def compose_picture(
     """
     for _ in range(doublings):
         maps = double_size(maps)
-    by_map, by_output = split_channels(maps, MAPS), split_channels(outputs, OUTPUTS)
-    (factor, summand, reflected), (shade, open_sky, shine, glow) = (
-        [values[name][..., None] for name in names.split()]
-        for values, names in ((by_map, "factor summand reflected"), (by_output, "shade open_sky shine glow"))
-    )
+    by_map, by_output = split_channels(maps, MAPS, keep_axis=True), split_channels(outputs, OUTPUTS, keep_axis=True)
     base = clamp(by_map["color"] + COLOR_STEP * by_output["color_step"], 0, 1)
-    metallic = clamp(by_map["metallic"] + COLOR_STEP * by_output["metallic_step"], 0, 1)[..., None]
+    metallic = clamp(by_map["metallic"] + COLOR_STEP * by_output["metallic_step"], 0, 1)
     coverage = by_map["opacity"]
     alpha = nn.sigmoid(logit(coverage) + LOGIT_STEP * by_output["logit_step"]) * one_minus_exp(coverage / NOTHING)
     bounced = by_output["bounced_constant"] * light_harmonics[:, None, None, 0]
     bounced += jnp.einsum("bhwk,bkc->bhwc", by_output["bounced_bands"], light_harmonics[:, 1:], precision="highest")
     unshadowed, mirrored = by_map["unshadowed"], by_map["mirrored"]
-    mirrored += clamp(by_output["rougher"], 0, 1)[..., None] * (unshadowed - mirrored)
-    diffuse = (1 + shade) * by_map["irradiance"] + open_sky * unshadowed + bounced
-    specular = (1 + shine) * reflected + glow
-    normal_incidence = SPECULAR * (1 - metallic) + base * metallic
-    linear = base * (1 - metallic) * diffuse + (normal_incidence * factor + summand) * mirrored * specular
-    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha
+    mirrored += clamp(by_output["rougher"], 0, 1) * (unshadowed - mirrored)
+    diffuse = (1 + by_output["shade"]) * by_map["irradiance"] + by_output["open_sky"] * unshadowed + bounced
+    specular = (1 + by_output["shine"]) * by_map["reflected"] + by_output["glow"]
+    reflectance = (SPECULAR * (1 - metallic) + base * metallic) * by_map["factor"] + by_map["summand"]
+    linear = base * (1 - metallic) * diffuse + reflectance * mirrored * specular
+    return smaller(linear_to_srgb(larger(linear, 0)), 1), alpha[..., 0]

@@ -345,7 +345,7 @@ def mirror(view: Arrays, axis: int) -> Arrays:
     flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
     return {
         **flipped,
-        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.find_odd_inputs(axis)),
+        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.ODD[axis]),
         "ambient": view["ambient"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
     }
 
