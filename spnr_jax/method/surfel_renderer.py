@@ -40,7 +40,7 @@ from spnr_jax.kernels.records import (
 )
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, compose_picture
-from spnr_jax.surfels import lighting, splatting
+from spnr_jax.surfels import blending, lighting, splatting
 from spnr_jax.surfels.splatting import MOST_ENTRIES
 
 # With the spacing p of the points in pixels: the fewest doublings n for which p / 2^n < COARSEST; a G-buffer of twice
@@ -299,8 +299,8 @@ def rasterize(
     """The G-buffer of a view, with the light that surfels receive; and how many entries and pixels did not fit."""
     entries, overflow = splatting.make_entries(surfels, camera, capacity=capacity)
     surfels = shader.face_camera(surfels, camera)
-    buffer = splatting.blend(entries, surfels, shader.compute_attributes(surfels, light, camera), camera, slots=slots)
-    return buffer, overflow + jnp.maximum(splatting.count_covered_pixels(entries) - slots, 0)
+    buffer = blending.blend(entries, surfels, shader.compute_attributes(surfels, light, camera), camera, slots=slots)
+    return buffer, overflow + jnp.maximum(blending.count_covered_pixels(entries) - slots, 0)
 
 
 def prepare_inputs(

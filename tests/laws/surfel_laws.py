@@ -19,7 +19,7 @@ from support.surfel_clouds import surfels, tangents
 from spnr_jax.kernels import numerics
 from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
-from spnr_jax.surfels import discs, layers, lighting, splatting
+from spnr_jax.surfels import blending, discs, layers, lighting
 from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS
 
 POINTS = 16
@@ -207,7 +207,7 @@ def lists(rng, tau=1.0, distance=2.0):
 
 
 def shares_twin(tau, depth, spacing):
-    return reference.shares(tau, depth, spacing, splatting.COMPARED)
+    return reference.shares(tau, depth, spacing, blending.COMPARED)
 
 
 @st.composite
@@ -235,9 +235,9 @@ def within_one(arguments, outputs):
 # fmt: off
 LISTS = (
     # thin lists are a series, to 7e-9: no twin
-    Law("blend weights", splatting.compute_blend_weights, None,
+    Law("blend weights", blending.compute_blend_weights, None,
         (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 1.0)),
-    Law("blend weights beside the loop", splatting.compute_blend_weights, shares_twin,
+    Law("blend weights beside the loop", blending.compute_blend_weights, shares_twin,
         (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 1.0),
         extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,
         atol=lambda tau, *x: 1e-6 * (1 + gap_rounding(tau, *x) * tau.max()), check=within_one)),

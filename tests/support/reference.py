@@ -153,7 +153,7 @@ def batch_norm(x, epsilon=1e-5):
 
 
 def shares(tau, depth, spacing, near):
-    """Twin of splatting.compute_blend_weights: blend weights of lists (entries, slots), and transmittances.
+    """Twin of blending.compute_blend_weights: blend weights of lists (entries, slots), and transmittances.
 
     Entries less than a spacing apart in depth blend; those more than `near` places before another hide it.
     """

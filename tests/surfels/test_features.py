@@ -11,7 +11,7 @@ from support.surfel_clouds import camera, shape, surfels
 
 from spnr_jax.kernels.records import Camera
 from spnr_jax.nn import shader
-from spnr_jax.surfels import splatting
+from spnr_jax.surfels import blending, splatting
 from spnr_jax.surfels.lighting import WIDTH, light_of
 
 VIEW = (1.4, 0.9, 1.7)
@@ -26,7 +26,7 @@ def sky():
 def drawn(found, light, view):
     found = shader.face_camera(found, view)
     entries, _ = splatting.make_entries(found, view, capacity=2**15)
-    buffer = splatting.blend(entries, found, shader.compute_attributes(found, light, view), view, slots=24**2)
+    buffer = blending.blend(entries, found, shader.compute_attributes(found, light, view), view, slots=24**2)
     return buffer, *shader.compute_inputs(buffer, light, view)
 
 

@@ -11,11 +11,11 @@ from support.laws import close, hypotheses, numbers
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
-from spnr_jax.surfels import splatting
-from spnr_jax.surfels.splatting import compute_blend_weights
+from spnr_jax.surfels import blending, splatting
+from spnr_jax.surfels.blending import compute_blend_weights
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
-blend = jax.jit(splatting.blend, static_argnames="slots")
+blend = jax.jit(blending.blend, static_argnames="slots")
 make_entries = jax.jit(splatting.make_entries, static_argnames="capacity")
 count = jax.jit(lambda found, view: splatting.count_entries(splatting.project_discs(found, view).covered))
 
@@ -26,7 +26,7 @@ def draw(found, view, attributes=None):
     entries, lost = make_entries(found, view, capacity=TOTAL)
     assert int(np.sum(np.asarray(entries.pixel) < view.height * view.width)) <= int(count(found, view)) <= TOTAL
     assert int(lost) == 0
-    assert int(splatting.count_covered_pixels(entries)) <= view.height * view.width
+    assert int(blending.count_covered_pixels(entries)) <= view.height * view.width
     buffer = blend(entries, found, jnp.asarray(attributes), view, slots=view.height * view.width)
     return jax.tree.map(np.asarray, buffer), entries
 
@@ -41,14 +41,14 @@ def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
 
 def blend_twin(entries, found, view, pixel):
     """Opacity, coverage, depth, spread, log spacing, normal and attributes of one pixel, in float64."""
-    order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: splatting.LIST_LENGTH]
+    order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: blending.LIST_LENGTH]
     point = np.asarray(entries.point)[order]
     kernel, facing, depth = (np.float64(x)[order] for x in (entries.kernel, entries.facing, entries.depth))
     spacing, weight = np.float64(found.spacing)[point], kernel**2 * facing
-    lists = (x[:, None] for x in (splatting.CENTRE_TAU * weight, depth, spacing))
-    share, left = (x[:, 0] for x in reference.shares(*lists, splatting.COMPARED))
+    lists = (x[:, None] for x in (blending.CENTRE_TAU * weight, depth, spacing))
+    share, left = (x[:, 0] for x in reference.shares(*lists, blending.COMPARED))
     opacity = share.sum()
-    divisor = max(opacity, splatting.LEAST_OPACITY)
+    divisor = max(opacity, blending.LEAST_OPACITY)
     mean = share @ depth / divisor
     spread = np.sqrt(share @ (depth - mean) ** 2 / divisor)
     normal = np.float64(found.normal)[point] @ np.float64(view.cam_to_world)[:, :3]
@@ -66,7 +66,7 @@ class TestShares:
     def test_those_of_thin_layers_are_those_of_a_float64_loop(self):
         dense, (tau, *others) = 0.005, self.lists(0, 6.0)
         share, left = compute_blend_weights(*map(jnp.asarray, (dense * tau, *others)))
-        expected, behind = reference.shares(dense * tau, *others, splatting.COMPARED)
+        expected, behind = reference.shares(dense * tau, *others, blending.COMPARED)
         close((share / dense, left), (expected / dense, behind), rtol=2e-5, atol=2e-6)
 
     def test_layers_that_are_well_apart_add_up_to_the_opacity_of_their_optical_depth(self):
@@ -112,7 +112,7 @@ class TestEntries:
         for size in (24, 2100):  # the second has more pixels than 21 bits count
             view = camera(size, field_of_view=2.9 if size > 24 else 0.7)
             entries, lost = make_entries(found, view, capacity=int(count(found, view)))
-            slots = splatting.count_covered_pixels(entries)
+            slots = blending.count_covered_pixels(entries)
             assert int(lost) == 0
             order, pixel = np.asarray(entries.order), np.asarray(entries.pixel)
             live = pixel < size**2
@@ -154,7 +154,7 @@ class TestBlend:
         )
         view = camera(24, (0.0, 0.6 * away, 0.8 * away))
         entries, lost = make_entries(found, view, capacity=TOTAL)
-        assume(int(lost) == 0 and int(splatting.count_covered_pixels(entries)) > 0)
+        assume(int(lost) == 0 and int(blending.count_covered_pixels(entries)) > 0)
         buffer = blend(entries, found, found.base_color, view, slots=24**2)
         names = ("opacity", "coverage", "depth", "depth_deviation", "log_spacing", "normal", "attributes")
         entries, buffer = jax.tree.map(np.asarray, (entries, buffer))
