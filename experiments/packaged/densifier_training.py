@@ -32,8 +32,9 @@ from spnr_jax.formats.surface_points import normalise, sample_surface
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.method.densifier import CANDIDATES, Candidates, Nodes, build_graph, init, predict, rotate, weigh_rows
+from spnr_jax.nn.point_prediction import init, predict, rotate, weigh_rows
 from spnr_jax.surfels import geometry, sides, symmetry
+from spnr_jax.surfels.candidates import CANDIDATES, Candidates, Nodes, build_graph
 from spnr_jax.surfels.geometry import PointColumns
 from spnr_jax.surfels.neighbors import order_in_space
 

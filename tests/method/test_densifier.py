@@ -14,8 +14,9 @@ from support.surfel_clouds import cloud, lumpy_ball, shape
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.method import densifier, surfel_method
-from spnr_jax.method.densifier import CANDIDATES, Nodes, place_candidates
-from spnr_jax.surfels import symmetry
+from spnr_jax.nn import point_prediction
+from spnr_jax.surfels import candidates, symmetry
+from spnr_jax.surfels.candidates import CANDIDATES, Nodes, build_graph, place_candidates
 from spnr_jax.surfels.neighbors import measure_evenness
 from spnr_jax.training import weights
 
@@ -110,11 +111,11 @@ def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
 def test_blocks_are_the_whole_at_once(params, monkeypatch):
     points = ball()
     near = jnp.asarray(spnr_jax.neighbors(points))
-    nodes, places = jax.jit(densifier.build_graph)(points, near)
+    nodes, places = jax.jit(build_graph)(points, near)
     found = []
     for block in (SIZE * CANDIDATES, 37):
-        monkeypatch.setattr(densifier, "BLOCK", block)
-        found.append(jax.jit(lambda *x: densifier.predict(*x))(params["densifier"], nodes, near, places))
+        monkeypatch.setattr(point_prediction, "BLOCK", block)
+        found.append(jax.jit(lambda *x: point_prediction.predict(*x))(params["densifier"], nodes, near, places))
     jax.tree.map(lambda *x: close(*(y[np.asarray(places.exists)] for y in x), atol=1e-5), *found)
 
 
@@ -124,7 +125,7 @@ def test_a_dense_cloud_gets_learned_points_where_it_ends_or_bends_alone(monkeypa
     near = spnr_jax.neighbors(cloud(edge * 0.05))
     nodes = nodes_of(edge * 0.05, np.repeat(np.eye(3)[[2, 0]], [400, 600], axis=0), 0.05)
     everywhere = jax.jit(place_candidates)(nodes, near)
-    monkeypatch.setattr(densifier, "SPARSE", len(edge) - 1)
+    monkeypatch.setattr(candidates, "SPARSE", len(edge) - 1)
     some = jax.jit(lambda *x: place_candidates(*x))(nodes, near)
     pairs = [np.asarray(x.exists & (x.first != x.second)) for x in (everywhere, some)]
     middle = [np.asarray(x.middle)[y] for x, y in zip((everywhere, some), pairs, strict=True)]
@@ -141,7 +142,7 @@ def test_both_sides_of_a_thin_wall_get_learned_points(monkeypatch):
     wall = np.concatenate([np.insert(grid, 2, 0, axis=1), np.insert(grid + 0.02, 2, -0.02, axis=1)])
     normals = np.repeat([[0, 0, 1.0], [0, 0, -1.0]], 400, axis=0)
     points = dataclasses.replace(cloud(wall), normals=np.float32(normals))
-    monkeypatch.setattr(densifier, "SPARSE", 0)
+    monkeypatch.setattr(candidates, "SPARSE", 0)
     found = jax.jit(lambda *x: place_candidates(*x))(nodes_of(wall, normals, 0.05), spnr_jax.neighbors(points))
     facing = normals[:, 2]
     same = np.asarray(found.exists & (found.first != found.second)) & (facing[found.first] == facing[found.second])
