@@ -53,7 +53,7 @@ class PointCloud:
 class Camera:
     """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels.
 
-    `height` and `width` are static, because they shape arrays; inside a program they may be traced.
+    `height` and `width` are static, because they shape arrays.
     """
 
     cam_to_world: Float[AnyArray, "*batch 3 4"]

@@ -41,7 +41,7 @@ from spnr_jax.kernels.records import (
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, compose_picture
 from spnr_jax.surfels import blending, lighting, splatting
-from spnr_jax.surfels.splatting import MOST_ENTRIES
+from spnr_jax.surfels.splatting import MOST_ENTRIES, Footprints
 
 # With the spacing p of the points in pixels: the fewest doublings n for which p / 2^n < COARSEST; a G-buffer of twice
 # the picture's resolution, averaged, if p < FINEST
@@ -150,10 +150,9 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
     """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
     whole = scale_camera(scene, camera, doublings, side)
-    corner, width, height = place_window(scene.surfels, whole)
-    foot = splatting.project_discs(scene.surfels, crop_camera(whole, corner, width, height))
-    largest = whole.height + MARGIN + STEP, whole.width + MARGIN + STEP  # a window may extend beyond the picture
-    slots = splatting.bound_covered_pixels(foot, largest)
+    foot = splatting.project_discs(scene.surfels, whole)
+    _, width, height = place_window(foot)
+    slots = splatting.bound_covered_pixels(foot, whole)
     return Sizes(width, height, splatting.count_entries(foot.covered), slots)
 
 
@@ -182,9 +181,8 @@ def scale_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) 
     return dataclasses.replace(inside, intrinsics=camera.intrinsics * scale, height=height, width=width)
 
 
-def place_window(surfels: Surfels, camera: Camera) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
-    """Corner (column, row), width and height of the window around the visible surfels."""
-    foot = splatting.project_discs(surfels, camera)
+def place_window(foot: Footprints) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
+    """Corner (column, row), width and height of the window around the discs; it may reach beyond the picture."""
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
@@ -200,7 +198,7 @@ def round_up(pixels: Any) -> Any:
     return -(-pixels // STEP) * STEP
 
 
-def crop_camera(camera: Camera, corner: Int[Array, "2"], width: Any, height: Any) -> Camera:
+def crop_camera(camera: Camera, corner: Int[Array, "2"], width: int, height: int) -> Camera:
     """The camera whose picture is the window."""
     moved = jnp.asarray(camera.intrinsics).at[:2, 2].add(-corner.astype(camera.intrinsics.dtype))
     return dataclasses.replace(camera, intrinsics=moved, height=height, width=width)
@@ -268,9 +266,11 @@ register(WindowBuffer)
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
     whole = scale_camera(scene, camera, plan.doublings, plan.side)
-    corner, width, height = jax.lax.stop_gradient(place_window(scene.surfels, whole))
+    foot = splatting.project_discs(scene.surfels, whole)
+    corner, width, height = place_window(foot)
+    foot = splatting.move_to_window(foot, corner, plan.width, plan.height)
     window = crop_camera(whole, corner, plan.width, plan.height)
-    buffer, overflow = rasterize(scene.surfels, window, light, capacity=plan.entries, slots=plan.slots)
+    buffer, overflow = rasterize(scene.surfels, foot, window, light, capacity=plan.entries, slots=plan.slots)
     beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
     return WindowBuffer(buffer, corner, jnp.minimum(overflow, splatting.MOST_COUNTED) + beyond)
 
@@ -294,12 +294,13 @@ def shade_window(
 
 
 def rasterize(
-    surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
+    surfels: Surfels, foot: Footprints, camera: Camera, light: Light, *, capacity: int, slots: int
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """The G-buffer of a view, with the light that surfels receive; and how many entries and pixels did not fit."""
-    entries, overflow = splatting.make_entries(surfels, camera, capacity=capacity)
+    entries, overflow = splatting.make_entries(foot, camera, capacity=capacity)
     surfels = shader.face_camera(surfels, camera)
-    buffer = blending.blend(entries, surfels, shader.compute_attributes(surfels, light, camera), camera, slots=slots)
+    attributes = shader.compute_attributes(surfels, light, camera)
+    buffer = blending.blend(entries, foot, surfels, attributes, camera, slots=slots)
     return buffer, overflow + jnp.maximum(blending.count_covered_pixels(entries) - slots, 0)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from spnr_jax.kernels import numerics
 from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep
 from spnr_jax.kernels.records import Camera, GBuffer, Surfels
-from spnr_jax.surfels.splatting import Entries, project_discs
+from spnr_jax.surfels.splatting import Entries, Footprints
 
 CENTRE_TAU = 3.0  # optical depth at the centre of a disc
 LIST_LENGTH = 24  # largest number of entries of a pixel
@@ -30,13 +30,22 @@ FADE = 1e-4  # summed narrow weights below which the distances of the centres fa
 
 
 def blend(
-    entries: Entries, surfels: Surfels, attributes: Float[Array, "points features"], camera: Camera, *, slots: int
+    entries: Entries,
+    foot: Footprints,
+    surfels: Surfels,
+    attributes: Float[Array, "points features"],
+    camera: Camera,
+    *,
+    slots: int,
 ) -> GBuffer:
-    """The G-buffer from the entries of a picture, for its first `slots` covered pixels (`count_covered_pixels`)."""
+    """The G-buffer from the entries of a picture, for its first `slots` covered pixels (`count_covered_pixels`).
+
+    The normals of the surfels face the camera (`shader.face_camera`), those of their footprints outward.
+    """
     table, pixel_of = _build_lists(entries, slots, camera.height * camera.width)
     point, depth, coverage, blend_weight, sharp_weight = _weigh_entries(entries, table, jnp.asarray(surfels.spacing))
-    foot = project_discs(surfels, camera)
-    wide = jnp.concatenate([attributes, jnp.stack(foot.normal, axis=-1), jnp.log(surfels.spacing)[:, None]], axis=1)
+    normal = jnp.stack(numerics.rotate_columns(camera.cam_to_world[:, :3], surfels.normal), axis=-1)
+    wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
     narrow = jnp.concatenate([_gather_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
     opacity = jnp.sum(blend_weight, axis=0)

@@ -122,7 +122,7 @@ def _rectangles(
     normal: tuple[Array, Array, Array],
     radius: Float[Array, " points"],
     place: tuple[Array, Array],
-    size: tuple[int | AnyArray, int | AnyArray],
+    size: tuple[int, int],
 ) -> tuple[Array, Array, Array, Array]:
     """First column and row, width and height of each disc's bounding rectangle in the picture; width 0 outside it."""
     x, y, z = centre
@@ -142,14 +142,29 @@ def _rectangles(
     return left, top, width, height
 
 
+def move_to_window(foot: Footprints, corner: Int[Array, "2"], width: int, height: int) -> Footprints:
+    """The footprints in a window of the picture, whose corner is (column, row): rectangles are clipped to it."""
+    rows = foot.covered // foot.width
+    left, right = (jnp.clip(x - corner[0], 0, width) for x in (foot.left, foot.left + foot.width))
+    top, bottom = (jnp.clip(x - corner[1], 0, height) for x in (foot.top, foot.top + rows))
+    return foot._replace(
+        column=foot.column - corner[0],
+        row=foot.row - corner[1],
+        left=left,
+        top=top,
+        width=jnp.maximum(right - left, 1),
+        covered=(right - left) * (bottom - top),
+    )
+
+
 def count_entries(covered: Int[Array, " points"]) -> Int[Array, ""]:
     """Sum of the pixels that discs cover, at most MOST_COUNTED."""
     return jnp.minimum(jnp.sum(covered.astype(jnp.float32)), MOST_COUNTED).astype(jnp.int32)
 
 
-def bound_covered_pixels(foot: Footprints, most: tuple[int, int]) -> Int[Array, ""]:
-    """Number of pixels in the union of the discs' rectangles; `most` bounds the rows and columns of the picture."""
-    rows, columns = (n + 1 for n in most)
+def bound_covered_pixels(foot: Footprints, camera: Camera) -> Int[Array, ""]:
+    """Number of pixels in the union of the discs' rectangles."""
+    rows, columns = camera.height + 1, camera.width + 1
     across = (foot.left, 1), (foot.left + foot.width, -1)
     down = (foot.top, 1), (foot.top + foot.covered // foot.width, -1)
     count = jnp.zeros(rows * columns, jnp.int32)
@@ -159,12 +174,11 @@ def bound_covered_pixels(foot: Footprints, most: tuple[int, int]) -> Int[Array, 
     return jnp.sum(inside > 0, dtype=jnp.int32)
 
 
-def make_entries(surfels: Surfels, camera: Camera, *, capacity: int) -> tuple[Entries, Int[Array, ""]]:
+def make_entries(foot: Footprints, camera: Camera, *, capacity: int) -> tuple[Entries, Int[Array, ""]]:
     """The sorted entries of a picture, padded to `capacity`, and the number of those that did not fit.
 
     Discs that do not fit are left out as a whole, the last surfels first.
     """
-    foot = project_discs(surfels, camera)
     end = jnp.cumsum(foot.covered.astype(jnp.float32))  # exact up to 2**24, and does not overflow as int32 would
     covered = jnp.where(end <= capacity, foot.covered, 0)
     lost = count_entries(jnp.where(end <= capacity, 0, foot.covered))

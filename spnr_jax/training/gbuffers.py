@@ -43,7 +43,7 @@ from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, compose_picture
-from spnr_jax.surfels import lighting, normals
+from spnr_jax.surfels import lighting, normals, splatting
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import drop_materials, random_scan
 from spnr_jax.training.weights import add_companions
@@ -257,7 +257,8 @@ def prepare_view(
     surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
 ) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
     """Network input for a whole view, light maps, and spherical harmonics of the light."""
-    buffer, _ = surfel_renderer.rasterize(surfels, camera, light, capacity=capacity, slots=slots)
+    foot = splatting.project_discs(surfels, camera)
+    buffer, _ = surfel_renderer.rasterize(surfels, foot, camera, light, capacity=capacity, slots=slots)
     return surfel_renderer.prepare_inputs(buffer, light, camera)[:3]
 
 

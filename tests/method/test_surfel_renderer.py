@@ -151,6 +151,21 @@ def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     assert np.abs(one - np.asarray(render(None, scene, view).image)).max() > 0.01
 
 
+def test_a_plan_of_several_views_holds_each_and_changes_none():
+    found = surfels(*shape("sphere", 2000))
+    scene = SurfelScene(surfels=found, spacing=found.spacing[0], centre=jnp.zeros(3), scale=jnp.ones(()))
+    far, near = (camera(192, eye=(0.0, 0.6 * away, 0.8 * away)) for away in (3.2, 2.2))
+    cut = dataclasses.replace(near, intrinsics=near.intrinsics.at[0, 2].add(110))  # by the right border
+    assert choose_resolution(scene, far) == choose_resolution(scene, cut)
+    both = surfel_renderer.plan(scene, jax.tree.map(lambda *x: jnp.stack(x), far, cut))
+    draw = jax.jit(surfel_renderer.render, static_argnames="plan")
+    for view in (far, cut):
+        own, common = (draw(None, scene, view, LIGHT, plan=x) for x in (surfel_renderer.plan(scene, view), both))
+        assert int(own.overflow) == int(common.overflow) == 0
+        close(common.image, own.image, atol=1e-6)
+        assert np.asarray(own.acc).max() > 0.9
+
+
 def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh):
     share = 0.75
     view = camera(64)

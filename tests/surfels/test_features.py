@@ -25,8 +25,9 @@ def sky():
 @jax.jit
 def drawn(found, light, view):
     found = shader.face_camera(found, view)
-    entries, _ = splatting.make_entries(found, view, capacity=2**15)
-    buffer = blending.blend(entries, found, shader.compute_attributes(found, light, view), view, slots=24**2)
+    foot = splatting.project_discs(found, view)
+    entries, _ = splatting.make_entries(foot, view, capacity=2**15)
+    buffer = blending.blend(entries, foot, found, shader.compute_attributes(found, light, view), view, slots=24**2)
     return buffer, *shader.compute_inputs(buffer, light, view)
 
 

@@ -1,5 +1,7 @@
 """The G-buffer of discs: float64 loops, what a plane shows, what hides what, and continuity."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +17,18 @@ from spnr_jax.surfels import blending, splatting
 from spnr_jax.surfels.blending import compute_blend_weights
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
-blend = jax.jit(blending.blend, static_argnames="slots")
-make_entries = jax.jit(splatting.make_entries, static_argnames="capacity")
+
+
+@partial(jax.jit, static_argnames="slots")
+def blend(entries, found, attributes, view, slots):
+    return blending.blend(entries, splatting.project_discs(found, view), found, attributes, view, slots=slots)
+
+
+@partial(jax.jit, static_argnames="capacity")
+def make_entries(found, view, capacity):
+    return splatting.make_entries(splatting.project_discs(found, view), view, capacity=capacity)
+
+
 count = jax.jit(lambda found, view: splatting.count_entries(splatting.project_discs(found, view).covered))
 
 
