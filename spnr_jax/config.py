@@ -28,6 +28,7 @@ MATERIAL_CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 MOST_LAYERS, MOST_STAGES = 32, 16  # of a network: a damaged file must not cost minutes of tracing
 MOST_PIXELS = 2**14  # along a side of a picture
 LARGEST = 2**63  # of any number in a config
+LEAST_CROP = 16  # pixels along a side: smaller crops of G-buffers have no pixels within their margins
 
 
 def check(config: Any, positive: Collection[str] = (), shares: Collection[str] = ()) -> None:
@@ -296,7 +297,7 @@ class OptimizerConfig:
     final_lr_scale: float = 0.01
     """Learning rate of the last step relative to the peak."""
     ema_decay: float = 0.999
-    """Decay per step of the averaged weights that evaluation uses; ramps up from 0 in the first steps."""
+    """Decay per step of the averaged weights that evaluation uses; ramps up from 0.1 in the first steps."""
     algorithm: Literal["adam", "radam"] = "adam"
     """Adam, or rectified Adam for the generator."""
     decay: Literal["cosine", "exponential"] = "cosine"
@@ -323,13 +324,13 @@ class TrainConfig:
     num_steps: int = 100_000
     """Optimiser steps."""
     batch_objects: int = 8
-    """Objects per step."""
+    """Objects per step; surfels: crops per step."""
     views_per_object: int = 1
-    """Views per object and step; they share one encoding."""
+    """Views per object and step, which share one encoding; surfels: stored views of a cloud."""
     min_points: int = 512
     """Fewest points of a cloud in a training step."""
     max_points: int = 4096
-    """Most points of a cloud in a training step; clouds are padded to it."""
+    """Most points of a cloud in a training step; except for surfels, clouds are padded to it."""
     test_points: int = 1024
     """Points per object in evaluation."""
     seed: int = 0
@@ -337,7 +338,7 @@ class TrainConfig:
     pixel_stride: int = 1
     """Train on every n-th row and column of a view, at a random offset."""
     crop: int = 0
-    """Pixels along each side of the random crop of a view that is rendered in training; 0: the whole view."""
+    """Surfels: pixels along each side of the random crops of G-buffers that the shader trains on.  Others: 0."""
     even_share: float = 0.0
     """Share of the training clouds that are farthest-point sampled instead of random.  Surfels: sampled here.  Other
     networks: the first points of an object, which are even in a data set made with `--spread even`."""
@@ -359,11 +360,14 @@ class TrainConfig:
             f"pixel_stride {self.pixel_stride} needs a network whose pixels do not depend on their neighbours and an "
             f"image_resolution that it divides ({self.model.image_resolution}); use 1",
         )
-        require(
-            self.crop == 0 or (self.model.crops and self.crop <= self.model.image_resolution),
-            f"crop {self.crop} needs a network that is trained on squares of its views, and at most its "
-            f"image_resolution ({self.model.image_resolution}) pixels; use 0",
-        )
+        if self.model.crops:
+            require(
+                LEAST_CROP <= self.crop <= self.model.image_resolution,
+                f"crop {self.crop}: {self.model.method} is trained on squares of {LEAST_CROP} to "
+                f"{self.model.image_resolution} pixels (its image_resolution)",
+            )
+        else:
+            require(self.crop == 0, f"crop {self.crop}: {self.model.method} is trained on whole views; use 0")
         require(
             self.min_points <= self.max_points,
             f"min_points {self.min_points} must not exceed max_points {self.max_points}",

@@ -1,6 +1,7 @@
 """Configs: a wrong number is an error that names its field and what came, and the presets are what the paper says."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from spnr_jax.config import (
     TrainConfig,
 )
 from spnr_jax.methods import from_dict, to_dict
-from spnr_jax.presets import PRESETS, tiny
+from spnr_jax.presets import PRESETS, surfels, tiny
 
 
 @pytest.mark.parametrize(
@@ -52,6 +53,14 @@ def test_a_wrong_number_names_the_field_what_came_and_what_is_possible(kind, fie
         kind(**{field: value})
     assert hint in str(error.value)
     assert str(value) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("preset", "crop", "hint"), [(surfels, 0, "of 16 to 512"), (surfels, 513, "512"), (tiny, 48, "use 0")]
+)
+def test_crops_suit_the_network(preset, crop, hint):
+    with pytest.raises(ValueError, match=f"crop {crop}: .*{hint}"):
+        replace(preset(), crop=crop)
 
 
 OWN = [name for name in PRESETS if PRESETS[name].__module__ == "spnr_jax.presets"]  # other tests add to them

@@ -275,7 +275,7 @@ class Crops:
 
     inputs: Float[AnyArray, "crops rows columns 33"]
     maps: Float[AnyArray, "crops height width 17"]
-    ambient: Float[AnyArray, "crops 9 3"]
+    light_harmonics: Float[AnyArray, "crops 9 3"]
     target: UInt8[AnyArray, "crops h w 4"]
     doublings: int = struct.field(pytree_node=False)
     margin: int = struct.field(pytree_node=False, default=0)

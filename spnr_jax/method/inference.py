@@ -71,9 +71,9 @@ def loss(
         variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
     )
     terms = {name: value for name, (value,) in updated.get("losses", {}).items()}
-    if config.loss.opacity_weight:
+    if config.loss.opacity_weight or config.loss.opacity_l1_weight:
         opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
-        terms["opacity"] = config.loss.opacity_weight * losses.mse(rendering.acc, opacity)
+        terms["opacity"] = opacity_loss(config, rendering.acc, opacity)
     mask = rendering.acc > 0 if config.loss.masked else None
     reference = jnp.asarray(batch.image)
     value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, mask)
@@ -108,6 +108,14 @@ def pixel_error(config: TrainConfig, image: Array, reference: Array, mask: Array
         return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
     error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
     return jnp.sum(jnp.where(mask[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(mask), 1)
+
+
+def opacity_loss(
+    config: TrainConfig, opacity: Float[Array, "*batch"], reference: Float[Array, "*batch"]
+) -> Float[Array, ""]:
+    """Weighted squared error and L1 of the opacity."""
+    squared = config.loss.opacity_weight * losses.mse(opacity, reference)
+    return squared + config.loss.opacity_l1_weight * losses.l1(opacity, reference)
 
 
 def reconstruction_loss(

@@ -39,7 +39,7 @@ from spnr_jax.kernels.records import (
     unstack,
 )
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, compose_picture
+from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, ShaderInputs, compose_picture
 from spnr_jax.surfels import blending, lighting, splatting
 from spnr_jax.surfels.splatting import MOST_ENTRIES, Footprints
 
@@ -287,7 +287,9 @@ def shade_window(
     """The second half: the network over the G-buffer."""
     whole = scale_camera(scene, camera, plan.doublings, plan.side)
     window = crop_camera(whole, window_buffer.corner, plan.width, plan.height)
-    layers = shade(params, *prepare_inputs(window_buffer.buffer, light, window), doublings=plan.doublings)
+    buffer = window_buffer.buffer
+    given = shader.compute_inputs(buffer, light, window)
+    layers = shade(params, given, buffer.depth, doublings=plan.doublings)
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     image, depth, acc = paste_window(layers, window_buffer.corner * 2**plan.doublings, inside, plan.side)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
@@ -304,31 +306,15 @@ def rasterize(
     return buffer, overflow + jnp.maximum(blending.count_covered_pixels(entries) - slots, 0)
 
 
-def prepare_inputs(
-    buffer: GBuffer, light: Light, camera: Camera
-) -> tuple[
-    Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"], Float[Array, "height width"]
-]:
-    """Inputs of the network, light maps, spherical harmonics of the light in camera axes, and depth."""
-    inputs, maps = shader.compute_inputs(buffer, light, camera)
-    return inputs, maps, lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]), buffer.depth
-
-
 def shade(
-    params: dict | None,
-    inputs: Float[Array, "height width 33"],
-    maps: Float[Array, "height width 17"],
-    ambient: Float[Array, "9 3"],
-    depth: Float[Array, "height width"],
-    *,
-    doublings: int,
+    params: dict | None, given: ShaderInputs, depth: Float[Array, "height width"], *, doublings: int
 ) -> Float[Array, "h w 5"]:
     """Colour times opacity, opacity, and depth along the camera's axis times opacity, at the doubled resolution."""
     if params is None:
-        outputs = jnp.zeros((1, *(n << doublings for n in inputs.shape[:2]), NUM_OUTPUTS))
+        outputs = jnp.zeros((1, *(n << doublings for n in depth.shape), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, inputs[None], doublings))
-    color, alpha = compose_picture(outputs, maps[None], ambient[None], doublings)
+        outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, given.inputs[None], doublings))
+    color, alpha = compose_picture(outputs, given.maps[None], given.light_harmonics[None], doublings)
     known = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
     for _ in range(doublings):
         known = double_size(known)

@@ -12,6 +12,7 @@ linear in it up to the sRGB curve.
 import dataclasses
 from functools import partial, reduce
 from operator import add
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -120,10 +121,16 @@ def compute_attributes(surfels: Surfels, light: Light, camera: Camera) -> Float[
     return stack_channels(values, ATTRIBUTES)
 
 
-def compute_inputs(
-    buffer: GBuffer, light: Light, camera: Camera
-) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"]]:
-    """The network's INPUTS, and the MAPS for `compose_picture`."""
+class ShaderInputs(NamedTuple):
+    """The network's INPUTS, the MAPS for `compose_picture`, and the light's spherical harmonics in camera axes."""
+
+    inputs: Float[Array, "height width 33"]
+    maps: Float[Array, "height width 17"]
+    light_harmonics: Float[Array, "9 3"]
+
+
+def compute_inputs(buffer: GBuffer, light: Light, camera: Camera) -> ShaderInputs:
+    """What the network and `compose_picture` need of a G-buffer and a light."""
     of = split_channels(buffer.attributes, ATTRIBUTES)
     blended = of["base_color"]
     confidence = (buffer.sharp_weight / (buffer.sharp_weight + LEAST_SHARP))[..., None]  # 0 far from all discs
@@ -166,7 +173,11 @@ def compute_inputs(
         "mirrored": jnp.stack(lighting.reflect(light, mirrored_in_world, of["roughness"]), axis=-1),
         "reflected": of["reflected"],
     }
-    return drawn[..., None] * stack_channels(inputs, INPUTS), stack_channels(maps, MAPS)
+    return ShaderInputs(
+        inputs=drawn[..., None] * stack_channels(inputs, INPUTS),
+        maps=stack_channels(maps, MAPS),
+        light_harmonics=lighting.project_harmonics(light, jnp.asarray(camera.cam_to_world)[:, :3]),
+    )
 
 
 def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Array]]:

@@ -2,12 +2,14 @@
 
     FOLDER/OBJECT.CLOUD.npz    views of one random cloud of an object
         doublings              (views,): how often the network doubles each view's resolution
-        seen0, seen1, ...      network input of each view, in the window around the object, float16
-        maps, ambient, target  likewise: light maps in float16, the light's harmonics, the reference in 8 bits
+        inputs0, inputs1, ...  network input of each view, in the window around the object, float16
+        maps, light_harmonics  likewise: light maps in float16, the light's spherical harmonics
+        target                 likewise: the reference in 8 bits
 
 A file is a pure function of object, cloud and what `digest` covers, which it holds as `source`; it is written
-atomically.  One that cannot be read, or was made of something else, is made again.  A batch is a pure function of
-(seed, step) and the list of files; its crops have equal doublings.
+atomically.  One that cannot be read, or was made of something else, is made again.  The code is not covered: remove the
+folder after a change of the surfels or of the clouds that are drawn.  A batch is a pure function of (seed, step) and
+the list of files; its crops have equal doublings.
 """
 
 import dataclasses
@@ -38,12 +40,12 @@ from spnr_jax.kernels.cloud_arrays import farthest_points
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Camera, Crops, Key, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
-from spnr_jax.method.inference import reconstruction_loss
+from spnr_jax.method.inference import opacity_loss, reconstruction_loss
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import Shader, compose_picture
-from spnr_jax.surfels import lighting, normals, splatting
+from spnr_jax.nn.shader import Shader, ShaderInputs, compose_picture
+from spnr_jax.surfels import layers, lighting, normals, splatting
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import drop_materials, random_scan
 from spnr_jax.training.weights import add_companions
@@ -70,7 +72,7 @@ LEAST_INSIDE = 1.0  # pixels; without a pixel of the object the error inside it 
 CLOUD_STREAM, CROP_STREAM = 3, 4  # random streams under one seed, in addition to those of `batching`
 
 Arrays = dict[str, np.ndarray]
-NAMES = ("seen", "maps", "ambient", "target")
+NAMES = ("inputs", "maps", "light_harmonics", "target")
 
 
 class KeptView(NamedTuple):
@@ -104,17 +106,16 @@ def loss(
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the picture on white and of the opacity, weighted as the config says."""
     assert isinstance(config.model, SurfelConfig)
-    shader = Shader(config.model.widths, config.model.top)
-    params = {"params": variables["params"]}
-    outputs: Any = shader.apply(params, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
-    color, alpha = compose_picture(outputs, jnp.asarray(crops.maps), jnp.asarray(crops.ambient), crops.doublings)
+    network, params = Shader(config.model.widths, config.model.top), {"params": variables["params"]}
+    outputs: Any = network.apply(params, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
+    maps, light_harmonics = jnp.asarray(crops.maps), jnp.asarray(crops.light_harmonics)
+    color, alpha = compose_picture(outputs, maps, light_harmonics, crops.doublings)
     image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
     reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]
     value = reconstruction_loss(config, image, image, reference)
-    value += config.loss.opacity_weight * losses.mse(alpha, opacity)
-    value += config.loss.opacity_l1_weight * losses.l1(alpha, opacity)
+    value += opacity_loss(config, alpha, opacity)
     squared = jnp.sum((image - reference) ** 2 * opacity[..., None])
     return value, Outcome(
         {
@@ -148,7 +149,9 @@ def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Pa
 def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict) -> UInt8[np.ndarray, "32"]:
     """A checksum of everything but object and cloud that G-buffers are made of."""
     names = "seed", "min_points", "max_points", "even_share", "views_per_object"
-    made_of = hashlib.sha256(json.dumps([[getattr(config, x) for x in names], dataset.settings]).encode())
+    chosen = [getattr(config, x) for x in names]
+    numbers = dataclasses.astuple(layers.CONSTANTS), list(shader.INPUTS.items()), list(shader.MAPS.items())
+    made_of = hashlib.sha256(json.dumps([chosen, dataset.settings, numbers]).encode())
     for leaf in jax.tree.leaves((light, variables)):
         made_of.update(np.asarray(leaf).tobytes())
     return np.frombuffer(made_of.digest(), np.uint8)
@@ -237,29 +240,27 @@ def make_view(
         return None
     whole = drawn.height * drawn.width
     capacity, slots = _round_size(int(needed.entries), 2**16), min(_round_size(int(needed.slots), whole // 16), whole)
-    inputs, maps, ambient = map(np.asarray, prepare_view(scene.surfels, drawn, light, capacity=capacity, slots=slots))
+    given = jax.device_get(prepare_view(scene.surfels, drawn, light, capacity=capacity, slots=slots))
     target = average_squares(image, side)
     shown = target[..., 3].reshape(drawn.height, scale, drawn.width, scale).max(axis=(1, 3))
-    inside = (inputs[..., 0] > FAINT) | (shown > 0)
+    inside = (given.inputs[..., 0] > FAINT) | (shown > 0)
     if not inside.any():
         return None
     rows, columns = _find_bounds(inside.any(axis=1)), _find_bounds(inside.any(axis=0))
     return doublings, {
-        "seen": inputs[rows, columns].astype(np.float16),
-        "maps": np.clip(maps[rows, columns], -LARGEST_FLOAT16, LARGEST_FLOAT16).astype(np.float16),
-        "ambient": ambient,
+        "inputs": given.inputs[rows, columns].astype(np.float16),
+        "maps": np.clip(given.maps[rows, columns], -LARGEST_FLOAT16, LARGEST_FLOAT16).astype(np.float16),
+        "light_harmonics": given.light_harmonics,
         "target": target[scale * rows.start : scale * rows.stop, scale * columns.start : scale * columns.stop],
     }
 
 
 @partial(jax.jit, static_argnames=("capacity", "slots"))
-def prepare_view(
-    surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int
-) -> tuple[Float[Array, "height width 33"], Float[Array, "height width 17"], Float[Array, "9 3"]]:
-    """Network input for a whole view, light maps, and spherical harmonics of the light."""
+def prepare_view(surfels: Surfels, camera: Camera, light: Light, *, capacity: int, slots: int) -> ShaderInputs:
+    """What the shader gets of a whole view."""
     foot = splatting.project_discs(surfels, camera)
     buffer, _ = surfel_renderer.rasterize(surfels, foot, camera, light, capacity=capacity, slots=slots)
-    return surfel_renderer.prepare_inputs(buffer, light, camera)[:3]
+    return shader.compute_inputs(buffer, light, camera)
 
 
 def _round_size(count: int, least: int) -> int:
@@ -270,9 +271,9 @@ def _round_size(count: int, least: int) -> int:
 def average_squares(image: UInt8[np.ndarray, "height width 4"], side: int) -> UInt8[np.ndarray, "h w 4"]:
     """The picture `side` times smaller: mean opacity of each square, and mean colour weighted by opacity."""
     alpha = image[..., 3:].astype(np.float32) / 255
-    layers = np.concatenate([image[..., :3] / np.float32(255) * alpha, alpha], axis=-1)
+    premultiplied = np.concatenate([image[..., :3] / np.float32(255) * alpha, alpha], axis=-1)
     height, width = (n // side for n in image.shape[:2])
-    means = layers.reshape(height, side, width, side, 4).mean(axis=(1, 3))
+    means = premultiplied.reshape(height, side, width, side, 4).mean(axis=(1, 3))
     return to_uint8(np.concatenate([means[..., :3] / np.maximum(means[..., 3:], 1e-4), means[..., 3:]], axis=-1))
 
 
@@ -305,7 +306,7 @@ def make_batch(views: dict[int, list[KeptView]], config: TrainConfig, step: int)
             crop = mirror(crop, axis) if generator.random() < 0.5 else crop
         crops.append(crop)
     stacked = {name: np.stack([crop[name] for crop in crops]) for name in NAMES}
-    return Crops(inputs=stacked.pop("seen"), **stacked, doublings=doublings, margin=margin)
+    return Crops(**stacked, doublings=doublings, margin=margin)
 
 
 def read_view(view: KeptView) -> Arrays:
@@ -320,7 +321,7 @@ def read_view(view: KeptView) -> Arrays:
 
 def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.random.Generator) -> Arrays:
     """A crop of a view that shows some of the object; padded with zeros beyond the view."""
-    inputs, inner = view["seen"], size - 2 * margin
+    inputs, inner = view["inputs"], size - 2 * margin
     for _ in range(TRIES):
         top, left = (int(generator.integers(0, max(n - inner, 0) + 1)) for n in inputs.shape[:2])
         if np.mean(inputs[top : top + inner, left : left + inner, 0] > VISIBLE_OPACITY) > LEAST_COVERED:
@@ -334,20 +335,20 @@ def crop_square(view: Arrays, size: int, margin: int, scale: int, generator: np.
         return np.pad(part, [*lacking, (0, 0)])
 
     return {
-        "seen": cut(inputs, margin, 1).astype(np.float32),
+        "inputs": cut(inputs, margin, 1).astype(np.float32),
         "maps": cut(view["maps"], 0, 1).astype(np.float32),
-        "ambient": view["ambient"],
+        "light_harmonics": view["light_harmonics"],
         "target": cut(view["target"], 0, scale),
     }
 
 
 def mirror(view: Arrays, axis: int) -> Arrays:
     """The view with object, camera and light mirrored along x (axis 0) or y (axis 1) of the camera."""
-    flipped = {name: np.flip(view[name], 1 - axis) for name in ("seen", "maps", "target")}
+    flipped = {name: np.flip(view[name], 1 - axis) for name in ("inputs", "maps", "target")}
     return {
         **flipped,
-        "seen": flipped["seen"] * _signs(shader.NUM_FEATURES, shader.ODD[axis]),
-        "ambient": view["ambient"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
+        "inputs": flipped["inputs"] * _signs(shader.NUM_FEATURES, shader.ODD[axis]),
+        "light_harmonics": view["light_harmonics"] * _signs(lighting.SH_BANDS, lighting.ODD[axis])[:, None],
     }
 
 

@@ -29,7 +29,7 @@ CONFIG = TrainConfig(
     min_points=32,
     max_points=40,
     test_points=32,
-    crop=12,
+    crop=16,
     even_share=0.5,
 )
 PACKAGED = weights.packaged_file

@@ -48,7 +48,7 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
         assert {*again, "source"} == set(file)
         assert all(np.array_equal(again[name], file[name]) for name in again)
         for different in (other, made(CONFIG.seed + 1, 0)):
-            assert not np.array_equal(different.get("seen0"), file["seen0"])
+            assert not np.array_equal(different.get("inputs0"), file["inputs0"])
 
 
 def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
@@ -148,13 +148,13 @@ def test_a_crop_shows_the_same_place_in_what_is_seen_and_in_the_reference(margin
     rows, columns = np.mgrid[:7, :9]
     place = (10 * rows + columns + 1)[..., None]
     fine = np.repeat(np.repeat(place, 4, axis=0), 4, axis=1)
-    view = {"seen": place / 100, "maps": place, "ambient": np.zeros((9, 3)), "target": fine.astype(np.uint8)}
+    view = {"inputs": place / 100, "maps": place, "light_harmonics": np.zeros((9, 3)), "target": fine.astype(np.uint8)}
     for seed in range(8):
         crop = gbuffers.crop_square(view, 8 + 2 * margin, margin, 4, np.random.default_rng(seed))
         inner = slice(margin, margin + 8)
-        assert crop["seen"].shape == (8 + 2 * margin, 8 + 2 * margin, 1)
-        np.testing.assert_allclose(100 * crop["seen"][inner, inner], crop["target"][::4, ::4], atol=1e-4)
-        assert np.isin(np.round(100 * crop["seen"]), [0, *place.ravel()]).all()
+        assert crop["inputs"].shape == (8 + 2 * margin, 8 + 2 * margin, 1)
+        np.testing.assert_allclose(100 * crop["inputs"][inner, inner], crop["target"][::4, ::4], atol=1e-4)
+        assert np.isin(np.round(100 * crop["inputs"]), [0, *place.ravel()]).all()
         np.testing.assert_array_equal(crop["maps"], crop["target"][2::4, 2::4])
         assert (crop["maps"][7] == 0).all(), "the view has seven rows"
 
@@ -180,17 +180,17 @@ def params():
 def test_mirroring_leaves_the_loss_of_the_untrained_network_as_it_is_and_is_its_own_inverse(axis, params):
     kept = tiny_surfels.views()[0]
     view = gbuffers.read_view(kept)
-    whole = gbuffers.crop_square(view, max(view["seen"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
+    whole = gbuffers.crop_square(view, max(view["inputs"].shape[:2]), 0, 2**kept.doublings, np.random.default_rng(0))
     turned = gbuffers.mirror(whole, axis)
     losses = [
         loss(
             params,
-            Crops(**{name.replace("seen", "inputs"): x[None] for name, x in one.items()}, doublings=kept.doublings),
+            Crops(**{name: x[None] for name, x in one.items()}, doublings=kept.doublings),
         )[0]
         for one in (whole, turned)
     ]
     np.testing.assert_allclose(*losses, rtol=1e-5)
-    assert not np.array_equal(whole["seen"], turned["seen"])
+    assert not np.array_equal(whole["inputs"], turned["inputs"])
     same_bits(gbuffers.mirror(turned, axis), whole)
 
 
@@ -215,8 +215,8 @@ def test_a_mirrored_object_is_seen_as_the_mirrored_view(axis):
             rim_distances=reach if sign.min() > 0 else reach[:, [0, 1, 3, 2]],  # normal x rim is not mirrored
         )  # fmt: skip
         seen.append(np.asarray(gbuffers.prepare_view(surfels, camera, LIGHT, capacity=2**14, slots=24 * 24)[0]))
-    view = {"seen": seen[0], "maps": seen[0], "target": seen[0], "ambient": np.zeros((9, 3))}
-    np.testing.assert_allclose(gbuffers.mirror(view, axis)["seen"], seen[1], atol=0.05)
+    view = {"inputs": seen[0], "maps": seen[0], "target": seen[0], "light_harmonics": np.zeros((9, 3))}
+    np.testing.assert_allclose(gbuffers.mirror(view, axis)["inputs"], seen[1], atol=0.05)
     assert np.abs(seen[1][..., shader.ODD[axis]]).mean() > 0.1
 
 
@@ -225,9 +225,9 @@ def test_harmonics_of_the_mirrored_light_are_the_mirrored_ones(axis):
     towards = np.random.default_rng(2).normal(size=(3, 50)).astype(np.float32)
     towards /= np.linalg.norm(towards, axis=0)
     turned = towards * np.where(np.arange(3) == axis, -1, 1)[:, None].astype(np.float32)
-    view = {name: np.zeros((2, 2, shader.NUM_FEATURES)) for name in ("seen", "maps", "target")}
+    view = {name: np.zeros((2, 2, shader.NUM_FEATURES)) for name in ("inputs", "maps", "target")}
     basis = np.stack(lighting.harmonics(*jnp.asarray(towards)))
-    expected = gbuffers.mirror(view | {"ambient": basis}, axis)["ambient"]
+    expected = gbuffers.mirror(view | {"light_harmonics": basis}, axis)["light_harmonics"]
     close(np.stack(lighting.harmonics(*jnp.asarray(turned))), expected, atol=1e-6)
 
 
@@ -239,7 +239,7 @@ def test_points_too_far_apart_for_the_reference_teach_nothing_and_too_near_ones_
     assert gbuffers.make_view(far, camera, item.images[0], 1, LIGHT) is None  # G-buffers of three pixels
     doublings, view = gbuffers.make_view(near, camera, item.images[0], 1, LIGHT)
     assert doublings == 0
-    assert view["seen"].shape[:2] == view["target"].shape[:2]
+    assert view["inputs"].shape[:2] == view["target"].shape[:2]
 
 
 def test_a_clear_pixel_costs_nothing_whatever_colour_lies_under_it(crops, params):
