@@ -10,7 +10,7 @@ from jaxlib import version  # without JAX
 
 _PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
 _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
-_PUBLIC |= {"neighbors": "surfels.neighbors", "encode": "surfels.geometry", "densify": "method.densifier"}
+_PUBLIC |= {"neighbors": "surfels.neighbors", "encode": "method.surfel_renderer", "densify": "method.densifier"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "make_cloud": "kernels.cloud_arrays", "clean": "kernels.cleaning"}
 _PUBLIC |= {"read_cameras": "formats.camera_files"}
 _PUBLIC |= {"splats": "tools.surfaces", "write_splats": "formats.gaussian_files"}

@@ -44,10 +44,9 @@ from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering
 from spnr_jax.method import surfel_renderer
 from spnr_jax.method.model import DISTANCE, FIELD_OF_VIEW
-from spnr_jax.method.surfel_renderer import Plan
+from spnr_jax.method.surfel_renderer import Plan, fit_box
 from spnr_jax.scoring.report import Table, number
 from spnr_jax.surfels import lighting
-from spnr_jax.surfels.geometry import fit_box
 from spnr_jax.surfels.lighting import solid_angles, texel_directions
 
 TURN, SHIFT, MOVED = np.deg2rad(8.0), 0.1, 0.5  # of a wrong pose, in radians and radii; of points, in spacings

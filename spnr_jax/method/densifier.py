@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Int
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import AnyArray, PointCloud
+from spnr_jax.method.surfel_renderer import check_inputs, normalise_cloud
 from spnr_jax.nn.point_prediction import LearnedPoints, predict, weigh_rows
 from spnr_jax.surfels.candidates import CANDIDATES, Candidates, Nodes, build_graph
-from spnr_jax.surfels.geometry import check_inputs, normalise_cloud
 from spnr_jax.surfels.neighbors import measure_evenness
 
 MOST_POINTS = 32768  # a cloud of more points gets no learned points

@@ -22,11 +22,10 @@ from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Resolution, Sizes
+from spnr_jax.method.surfel_renderer import Resolution, Sizes, make_scene
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
-from spnr_jax.surfels.geometry import make_scene
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors, order_in_space
 

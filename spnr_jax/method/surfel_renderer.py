@@ -18,18 +18,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
+from spnr_jax.kernels.cloud_arrays import check_cloud
 from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
-from spnr_jax.kernels.numerics import larger
+from spnr_jax.kernels.numerics import clamp, larger, largest, length, smallest
 from spnr_jax.kernels.records import (
     AnyArray,
     Camera,
     GBuffer,
     Light,
+    PointCloud,
     Rendering,
     Surfels,
     SurfelScene,
@@ -41,6 +43,9 @@ from spnr_jax.kernels.records import (
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, ShaderInputs, compose_picture
 from spnr_jax.surfels import blending, lighting, splatting
+from spnr_jax.surfels.geometry import estimate_surfels
+from spnr_jax.surfels.layers import NEIGHBORS
+from spnr_jax.surfels.neighbors import median
 from spnr_jax.surfels.splatting import MOST_ENTRIES, Footprints
 
 # With the spacing p of the points in pixels: the fewest doublings n for which p / 2^n < COARSEST; a G-buffer of twice
@@ -87,6 +92,81 @@ class Sizes(NamedTuple):
 
 
 register(Sizes)
+
+
+# --- scenes ---------------------------------------------------------------------------------------------------------
+
+
+def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
+    """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
+
+    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, also in
+    padding.  Surfels do not use `params`; the argument is there for networks that encode.  The result has the same
+    structure with and without normals.  Gradients also flow through the normalisation: a shift of all points moves the
+    scene's centre.  The docstring of `surfels/geometry.py` lists what has no gradient.
+    """
+    del params
+    check_inputs(cloud, neighbors, "encode")
+    # a cloud that a jitted function closes over is constant: XLA would take seconds to sort it while compiling
+    cloud, neighbors = jax.lax.optimization_barrier((cloud, neighbors))
+    inside, centre, scale = normalise_cloud(cloud)
+    return make_scene(inside, neighbors, centre, scale)
+
+
+def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
+    """ValueError, which names the function and the argument, for arrays that do not fit each other."""
+    check_cloud(cloud, where)
+    if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
+        found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
+        raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
+    if not isinstance(neighbors, jax.core.Tracer):
+        values = np.asarray(neighbors)
+        low, high = values.min(initial=-1), values.max(initial=-1)
+        if not np.issubdtype(values.dtype, np.integer) or low < -1 or high >= len(cloud.mask):
+            found = f"are {values.dtype} from {low} to {high}, expected indices of {len(cloud.mask)} points, or -1"
+            raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
+
+
+def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
+    """The cloud normalised to the box [-1, 1]^3, in at least float32, and the centre and scale of this transform."""
+
+    def promote(values: AnyArray) -> Array:
+        values = jnp.asarray(values)
+        return values if values.dtype == jnp.bool_ else values.astype(jnp.promote_types(values.dtype, jnp.float32))
+
+    cloud = jax.tree.map(promote, cloud)
+    positions = jnp.asarray(cloud.positions)
+    centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
+    inside = clamp((positions - centre[None]) * scale, -1, 1)
+    return dataclasses.replace(cloud, positions=inside), centre, scale
+
+
+def fit_box(
+    positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Centre and scale: (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
+
+    The scale of points without extent is 1.  Masked points do not count.
+    """
+    some = jnp.any(mask)
+    low = smallest(jnp.where(mask[:, None], positions, jnp.inf))
+    high = largest(jnp.where(mask[:, None], positions, -jnp.inf))
+    low, high = jnp.where(some, low, 0), jnp.where(some, high, 0)
+    diagonal = length(high - low)
+    scale = jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
+    return low / 2 + high / 2, scale
+
+
+def make_scene(
+    cloud: PointCloud,
+    neighbors: Int[AnyArray, "points 20"],
+    centre: Array,
+    scale: Array,
+) -> SurfelScene:
+    """The scene of a cloud that is already in the box; centre and scale are those of its transform."""
+    surfels = estimate_surfels(cloud, jnp.asarray(neighbors))
+    spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
+    return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------

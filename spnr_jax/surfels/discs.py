@@ -183,8 +183,8 @@ def find_color_edge(
     spacing: Float[Array, " block"],
     axes: Float[Array, "3 3 block"],
     colors: Float[Array, "k 3 block"],
-) -> dict[str, Array]:
-    """The fields `color_edge` (4, block) and `color_jump` (3, block): a straight edge between two colors, if any.
+) -> tuple[Float[Array, "4 block"], Float[Array, "3 block"]]:
+    """The fields `color_edge` and `color_jump` of `Surfels`: a straight edge between two colors, if any.
 
     With one color per disc, an edge would look frayed at the scale of the spacing.  Edges fade in smoothly.  Which
     neighbors have the other color is constant for gradients.
@@ -204,7 +204,7 @@ def find_color_edge(
     confidence = _measure_confidence(own, other) * _ramp(wrong, CONSTANTS.wrong_side)
     edge = [direction[0][None] * axes[0] + direction[1][None] * axes[1], (distance * spacing)[None]]
     jump = confidence[None] * (_mean(other, CHANGE) - _mean(own, CHANGE))
-    return {"color_edge": jnp.concatenate(edge), "color_jump": jump}
+    return jnp.concatenate(edge), jump
 
 
 def _ramp(values: Float[Array, " block"], ends: tuple[float, float]) -> Float[Array, " block"]:

@@ -8,7 +8,6 @@ one_sided   1 where the votes agree on the outer side, 0 where both sides are eq
 color_edge  a straight edge between two colors inside a disc; color_jump is the change of color across it (discs.py)
 rim         where the disc ends: at the rim of the layer or where another face cuts it (discs.py)
 shape       ratios of the neighbors' deviations: thickness / width (0 in a plane), width / length (0 on a line)
-scene       surfels in the box, with the transform from the cloud's units: the renderer's input
 
 Points are processed in blocks, one after the other, so that a million fit into memory.  A block reads its neighbors
 from arrays of all points, which are (columns, points) in this file.
@@ -18,31 +17,24 @@ have no gradient: the neighbors, the plane that the fit of a layer starts from, 
 another color, sides and flips of normals, and visibility from each direction.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spnr_jax.errors import UserError
-from spnr_jax.kernels.cloud_arrays import check_cloud
 from spnr_jax.kernels.numerics import (
     clamp,
     dot,
-    largest,
-    length,
     measure_shape,
     safe_sqrt,
-    smallest,
     tangent_frame,
     unit,
 )
-from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels, SurfelScene
+from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
-from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS, Layer, Neighborhood, project_on
+from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on
 from spnr_jax.surfels.neighbors import measure_evenness, median
 from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
@@ -82,19 +74,35 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> S
         position=columns(cloud.positions),
         color=columns(cloud.base_color),
     )
-    raw_spacing, layer = find_layers(points, normals, oriented=True, split_by_color=normals is None)
+    raw_spacing, layer = find_layers(points, normals, split_by_color=normals is None)
     visibility = estimate_visibility(points, layer.normal, raw_spacing)
     normal, one_sided = orient_layers(points, raw_spacing, layer, visibility)
+    layer_spacing, weight = measure_spacings(points, raw_spacing, layer, normal, one_sided)
     random = jnp.asarray(measure_evenness(cloud, neighbors)) < CONSTANTS.even
-    fields = describe_discs(points, raw_spacing, layer, normal, one_sided, visibility, random)
-    known = jnp.ones_like(raw_spacing) if cloud.materials_known is None else columns(cloud.materials_known)
-    learned = jnp.zeros_like(raw_spacing) if cloud.learned is None else columns(cloud.learned)
-    fields |= {"roughness": columns(cloud.roughness), "metallic": columns(cloud.metallic)}
-    fields |= {"materials_unknown": 1 - known, "learned": learned}
-    fields |= {"position": points.position, "normal": normal, "base_color": points.color, "one_sided": one_sided}
-    fields = {name: jnp.moveaxis(layers.select(mask, values, 0), -1, 0) for name, values in fields.items()}
-    fields["spacing"] = jnp.where(mask, fields["spacing"], 1)  # its logarithm is taken
-    return Surfels(**fields, mask=mask)
+    disc = describe_discs(points, raw_spacing, layer, normal, one_sided, layer_spacing, weight, random)
+    ones = jnp.ones_like(raw_spacing)
+
+    def rows(values: Array) -> Array:
+        return jnp.moveaxis(layers.select(mask, values, 0), -1, 0)
+
+    return Surfels(
+        position=rows(points.position),
+        normal=rows(normal),
+        spacing=jnp.where(mask, disc.spacing, 1),  # its logarithm is taken
+        one_sided=rows(one_sided),
+        shape_ratios=rows(disc.shape_ratios),
+        base_color=rows(points.color),
+        roughness=rows(columns(cloud.roughness)),
+        metallic=rows(columns(cloud.metallic)),
+        materials_unknown=rows(0 * ones if cloud.materials_known is None else 1 - columns(cloud.materials_known)),
+        learned=rows(0 * ones if cloud.learned is None else columns(cloud.learned)),
+        visibility=rows(average_visibility(points, weight, visibility)),
+        rim_tangent=rows(disc.rim_tangent),
+        rim_distances=rows(disc.rim_distances),
+        color_edge=rows(disc.color_edge),
+        color_jump=rows(disc.color_jump),
+        mask=mask,
+    )
 
 
 def map_blocks(
@@ -165,27 +173,27 @@ def find_layers(
     points: PointColumns,
     normals: Float[Array, "3 points"] | None,
     *,
-    oriented: bool,
     split_by_color: bool,
 ) -> tuple[Float[Array, " points"], Layer]:
     """Raw spacings, and layers from unit normals (0 where there is none).
 
-    Normals are kept.  If `oriented`, they separate the two sides of a thin wall.  With `split_by_color`, a point near
-    two surfaces closer than the thickness of a layer is assigned to one of them by its linear color.
+    Normals are kept; oriented ones separate the two sides of a thin wall.  With `split_by_color`, a point near two
+    surfaces closer than the thickness of a layer is assigned to one of them by its linear color.
     """
     roots = safe_sqrt(points.color)
 
-    def fit(hood: Neighborhood, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
+    def fit(hood: Neighborhood, oriented: Array, *own: Array) -> tuple[Array, Layer, layers.SplitLayer | None]:
         raw_spacing = discs.measure_raw_spacing(hood)
         weight = layers.weigh_distance(hood, raw_spacing)
         first, fixed = layers.init_normals(hood, raw_spacing, *own)
-        if oriented and own:
-            weight = weight * jnp.where(fixed[None], clamp(0.5 + project_on(hood.columns[:, 3:], first), 0, 1), 1)
+        if own:
+            weight = weight * jnp.where(oriented[None], clamp(0.5 + project_on(hood.columns[:, 3:], first), 0, 1), 1)
         color_distance = layers.measure_color_distance(hood, hood.columns[:, :3]) if split_by_color else None
         return raw_spacing, *layers.fit_layers(hood, raw_spacing, first, weight, fixed, color_distance)
 
     given = () if normals is None else (normals,)
-    raw_spacing, layer, split = map_blocks(fit, points, jnp.concatenate([roots, *given]), *given)
+    table = jnp.concatenate([roots, *given])
+    raw_spacing, layer, split = map_blocks(fit, points, table, points.oriented, *given)
     if split is None:
         return raw_spacing, layer
 
@@ -219,11 +227,10 @@ def orient_layers(
     layer: Layer,
     visibility: Float[Array, "64 points"],
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """Normals that point outward, and the confidence in that (`one_sided`)."""
-    normal, fixed = layer.normal, jax.lax.stop_gradient((points.position, raw_spacing, layer))
-    position, raw_spacing, layer = fixed
+    """Normals that point outward, and the confidence in that (`one_sided`); votes have no gradient."""
+    normal, oriented = layer.normal, points.oriented
+    position, raw_spacing, layer = jax.lax.stop_gradient((points.position, raw_spacing, layer))
     points = points._replace(position=position)
-    front, back = sides.sum_visibility(layer.normal, visibility)
 
     def vote(votes: Array, first: Array) -> tuple[Array, None]:
         def combine(hood: Neighborhood, raw_spacing: Array, layer: Layer, oriented: Array) -> Array:
@@ -232,11 +239,24 @@ def orient_layers(
             return sides.average_votes(hood, layer, raw_spacing, normals, votes) + first * walls
 
         table = jnp.concatenate([layer.normal, votes[None]])
-        return jnp.clip(map_blocks(combine, points, table, raw_spacing, layer, points.oriented), -1, 1), None
+        return jnp.clip(map_blocks(combine, points, table, raw_spacing, layer, oriented), -1, 1), None
 
+    front, back = sides.sum_visibility(layer.normal, visibility)
     votes = (front - back) / (front + back + CONSTANTS.vote_ridge)
-    towards, _ = jax.lax.scan(vote, votes, jnp.asarray([1, 0], raw_spacing.dtype))
-    return sides.orient_normals(normal, towards, points.oriented)
+    # two rounds of one compiled program; walls count in the first alone
+    votes, _ = jax.lax.scan(vote, votes, jnp.asarray([1, 0], raw_spacing.dtype))
+    return sides.orient_normals(normal, votes, oriented)
+
+
+class Discs(NamedTuple):
+    """The fields of `Surfels` that follow from layers and sides, as columns."""
+
+    spacing: Float[Array, " points"]
+    shape_ratios: Float[Array, "2 points"]
+    rim_tangent: Float[Array, "3 points"]
+    rim_distances: Float[Array, "4 points"]
+    color_edge: Float[Array, "4 points"]
+    color_jump: Float[Array, "3 points"]
 
 
 def describe_discs(
@@ -245,20 +265,20 @@ def describe_discs(
     layer: Layer,
     normal: Float[Array, "3 points"],
     one_sided: Float[Array, " points"],
-    visibility: Float[Array, "64 points"],
+    layer_spacing: Float[Array, " points"],
+    weight: Float[Array, "k points"],
     random: Bool[Array, ""],
-) -> dict[str, Array]:
-    """The fields of `Surfels` that follow from layers and sides (..., points); gaps of random points are covered."""
-    layer_spacing, weight = measure_spacings(points, raw_spacing, layer, normal, one_sided)
+) -> Discs:
+    """Size, rim and colors of each disc; gaps of random points are covered."""
 
-    def work(
+    def describe(
         hood: Neighborhood,
         raw_spacing: Array,
         layer: Layer,
         weight: Array,
         normal: Array,
         one_sided: Array,
-    ) -> dict[str, Array]:
+    ) -> Discs:
         normals, colors, neighbors_one_sided, spacings = jnp.split(hood.columns, [3, 6, 7], axis=1)
         axes, spacing = tangent_frame(normal), discs.smooth_spacing(weight, spacings[:, 0])
         flat = jnp.stack([project_on(hood.offset, axis) for axis in axes[:2]], axis=1)
@@ -269,19 +289,13 @@ def describe_discs(
         nearby = (weight > 0.5) & (hood.squared < (CONSTANTS.rim_radius * spacing[None]) ** 2)
         ends = discs.find_farthest(jnp.where(nearby[:, None], uv, 0)) + (CONSTANTS.rim_margin / wider)[None]
         clip_lines = discs.find_clip_lines(hood, axes, spacing, one_sided, normals, neighbors_one_sided[:, 0])
-        rim_tangent, rim_distances = discs.find_rims(ends, clip_lines, axes)
-        color_edge = discs.find_color_edge(uv, weight, spacing, axes, colors)
         own = layers.weigh_distance(hood, raw_spacing) * layers.weigh_height(layer)
-        return color_edge | {
-            "spacing": spacing,
-            "shape_ratios": measure_shape(layers.measure_covariance(hood, raw_spacing, own)),
-            "rim_tangent": rim_tangent,
-            "rim_distances": rim_distances,
-        }
+        shape_ratios = measure_shape(layers.measure_covariance(hood, raw_spacing, own))
+        rims = discs.find_rims(ends, clip_lines, axes)
+        return Discs(spacing, shape_ratios, *rims, *discs.find_color_edge(uv, weight, spacing, axes, colors))
 
     table = jnp.concatenate([normal, points.color, one_sided[None], layer_spacing[None]])
-    fields = map_blocks(work, points, table, raw_spacing, layer, weight, normal, one_sided)
-    return fields | {"visibility": average_visibility(points, weight, visibility)}
+    return map_blocks(describe, points, table, raw_spacing, layer, weight, normal, one_sided)
 
 
 def average_visibility(
@@ -316,78 +330,3 @@ def measure_spacings(
         return discs.measure_layer_spacing(hood, weight, raw_spacing), weight
 
     return map_blocks(weigh, points, normal, raw_spacing, layer, normal, one_sided)
-
-
-# --- scenes -----------------------------------------------------------------------------------------------------------
-
-
-def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
-    """The surfels of a cloud (unbatched, any units, y up); pure: jit, vmap over equally padded clouds, grad, float64.
-
-    `neighbors` are `spnr_jax.neighbors(cloud)`.  Positions, normals and colors must be finite, also in
-    padding.  Surfels do not use `params`; the argument is there for networks that encode.  The result has the same
-    structure with and without normals.  Gradients also flow through the normalisation: a shift of all points moves the
-    scene's centre.  The docstring of `geometry.py` lists what has no gradient.
-    """
-    del params
-    check_inputs(cloud, neighbors, "encode")
-    # a cloud that a jitted function closes over is constant: XLA would take seconds to sort it while compiling
-    cloud, neighbors = jax.lax.optimization_barrier((cloud, neighbors))
-    inside, centre, scale = normalise_cloud(cloud)
-    return make_scene(inside, neighbors, centre, scale)
-
-
-def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
-    """ValueError, which names the function and the argument, for arrays that do not fit each other."""
-    check_cloud(cloud, where)
-    if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
-        found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
-        raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
-    if not isinstance(neighbors, jax.core.Tracer):
-        values = np.asarray(neighbors)
-        low, high = values.min(initial=-1), values.max(initial=-1)
-        if not np.issubdtype(values.dtype, np.integer) or low < -1 or high >= len(cloud.mask):
-            found = f"are {values.dtype} from {low} to {high}, expected indices of {len(cloud.mask)} points, or -1"
-            raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
-
-
-def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
-    """The cloud normalised to the box [-1, 1]^3, in at least float32, and the centre and scale of this transform."""
-
-    def promote(values: AnyArray) -> Array:
-        values = jnp.asarray(values)
-        return values if values.dtype == jnp.bool_ else values.astype(jnp.promote_types(values.dtype, jnp.float32))
-
-    cloud = jax.tree.map(promote, cloud)
-    positions = jnp.asarray(cloud.positions)
-    centre, scale = fit_box(positions, jnp.asarray(cloud.mask))
-    inside = clamp((positions - centre[None]) * scale, -1, 1)
-    return dataclasses.replace(cloud, positions=inside), centre, scale
-
-
-def fit_box(
-    positions: Float[AnyArray, "points 3"], mask: Bool[AnyArray, " points"]
-) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Centre and scale: (positions - centre) * scale has its bounding box around 0, with half diagonal 1.
-
-    The scale of points without extent is 1.  Masked points do not count.
-    """
-    some = jnp.any(mask)
-    low = smallest(jnp.where(mask[:, None], positions, jnp.inf))
-    high = largest(jnp.where(mask[:, None], positions, -jnp.inf))
-    low, high = jnp.where(some, low, 0), jnp.where(some, high, 0)
-    diagonal = length(high - low)
-    scale = jnp.where(diagonal > 0, 2 / jnp.where(diagonal > 0, diagonal, 1), 1)
-    return low / 2 + high / 2, scale
-
-
-def make_scene(
-    cloud: PointCloud,
-    neighbors: Int[AnyArray, "points 20"],
-    centre: Array,
-    scale: Array,
-) -> SurfelScene:
-    """The scene of a cloud that is already in the box; centre and scale are those of its transform."""
-    surfels = estimate_surfels(cloud, jnp.asarray(neighbors))
-    spacing = median(jnp.asarray(surfels.spacing), jnp.asarray(surfels.mask))
-    return SurfelScene(surfels=surfels, spacing=spacing, centre=centre, scale=scale)

@@ -180,6 +180,6 @@ def outward_normals(
 @partial(jax.jit, compiler_options=QUICKEST)
 def _orient(points: PointColumns, normals: Float[Array, "3 points"]) -> Float[Array, "3 points"]:
     """The given normals turned outward; two-sided ones are kept."""
-    raw_spacing, layer = geometry.find_layers(points, normals, oriented=False, split_by_color=True)
+    raw_spacing, layer = geometry.find_layers(points, normals, split_by_color=True)
     visibility = geometry.estimate_visibility(points, layer.normal, raw_spacing)
     return geometry.orient_layers(points, raw_spacing, layer, visibility)[0]

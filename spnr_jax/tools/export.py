@@ -50,7 +50,7 @@ from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Light, PointCl
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.method.surfel_renderer import Plan
-from spnr_jax.surfels import geometry, lighting
+from spnr_jax.surfels import lighting
 from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
@@ -265,7 +265,7 @@ def encode(params: dict, cloud: Arrays) -> Arrays:
     """The scene of a cloud as a dict of arrays; pure."""
     points = PointCloud(**cloud)
     near = nearest(points.positions, points.mask)
-    return dict(to_state_dict(geometry.encode(params, points, near)))
+    return dict(to_state_dict(surfel_renderer.encode(params, points, near)))
 
 
 def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:

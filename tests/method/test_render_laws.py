@@ -13,8 +13,7 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_method import encode_in_box
-from spnr_jax.method.surfel_renderer import Plan, plan, render
-from spnr_jax.surfels.geometry import encode
+from spnr_jax.method.surfel_renderer import Plan, encode, plan, render
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.skies import sun

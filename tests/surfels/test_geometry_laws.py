@@ -12,8 +12,7 @@ from support.surfel_clouds import cloud, lumpy_ball, shape
 
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import normalization, pad
-from spnr_jax.method import surfel_method
-from spnr_jax.surfels import geometry
+from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.surfels.layers import NEIGHBORS
 
 COUNT, SIZE = 150, 160  # real points, and with padding
@@ -30,7 +29,7 @@ def with_normals(points):
 
 def projection(columns, points, near):
     """A number that all of a scene's fields with a gradient take part in, and the scene."""
-    scene = geometry.encode(None, dataclasses.replace(points, **columns), near)
+    scene = surfel_renderer.encode(None, dataclasses.replace(points, **columns), near)
     fields = {name: values for name, values in vars(scene.surfels).items() if name not in CONSTANT}
     fields |= {name: getattr(scene, name) for name in ("spacing", "centre", "scale")}
     rng = np.random.default_rng(5)
@@ -44,7 +43,7 @@ def projection(columns, points, near):
 
 
 def plain(points, near):
-    return geometry.encode(None, points, near)
+    return surfel_renderer.encode(None, points, near)
 
 
 both = jax.jit(jax.value_and_grad(projection, has_aux=True))
@@ -227,6 +226,6 @@ def test_half_floats_are_computed_in_float32(half):
     points = pad(cloud(shape("sphere", COUNT, "random")[0]), SIZE)
     halves = jax.tree.map(lambda x: x if x.dtype == np.bool_ else x.astype(half), points)
     wide = jax.tree.map(lambda x: x if x.dtype == np.bool_ else np.asarray(x, np.float32), halves)
-    jax.tree.map(np.testing.assert_array_equal, *map(geometry.normalise_cloud, (halves, wide)))
+    jax.tree.map(np.testing.assert_array_equal, *map(surfel_renderer.normalise_cloud, (halves, wide)))
     scene = jax.eval_shape(plain, halves, spnr_jax.neighbors(wide))
     assert {x.dtype for x in jax.tree.leaves(scene)} == {jnp.dtype(np.float32), jnp.dtype(np.bool_)}

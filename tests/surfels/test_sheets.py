@@ -26,7 +26,7 @@ def lined_ball(gap):
 
 @jax.jit
 def _both_layers(points):
-    return [geometry.find_layers(points, None, oriented=True, split_by_color=sheets)[1] for sheets in (False, True)]
+    return [geometry.find_layers(points, None, split_by_color=sheets)[1] for sheets in (False, True)]
 
 
 def layers_of(positions, colors):
