@@ -115,9 +115,9 @@ class Volume:
 @no_type_check
 @struct.dataclass
 class Surfels:
-    """Surface elements of one object (`surfels/geometry.py`): discs with materials; zeros where `mask` is False.
+    """Surface elements of one object (`surfels/geometry.py`): discs with materials.
 
-    Lengths are in units of the box, colours linear.
+    Lengths are in units of the box, colours linear.  Where `mask` is False, the spacing is 1 and all else 0.
     """
 
     position: Float[AnyArray, "*batch points 3"]

@@ -80,8 +80,8 @@ def select_points(
     """Which predicted points are kept: likely ones that are not too close to each other or to a measured point.
 
     Of two candidates that are too close, the one that is more likely and farther from measured points wins.  Each round
-    keeps those that beat all others close to them (maximal independent set, Luby 1986), so the order of points does not
-    matter.  The candidates of point i have the indices i * CANDIDATES + c.
+    keeps those that beat all others close to them (as for maximal independent sets, Luby 1986), so the order of points
+    does not matter.  The candidates of point i have the indices i * CANDIDATES + c.
     """
     count = len(neighbors)
     near = neighbors[:, :12]

@@ -39,6 +39,7 @@ MIN_RADIUS = 1.0  # smallest radius of a disc in the picture, in pixels
 RIM_WIDTH = 0.4  # spacings over which a disc fades out at the end of its layer
 RIM_SKIRT = 0.15  # share of the kernel kept beyond the end of a layer, from which the network can correct that end
 LEAST_COSINE = 0.02  # least cosine between ray and normal: smaller ones are replaced by it
+FACING_RAMP = -0.1, 0.2  # cosines between ray and normal from which, and to which, a one-sided disc fades in
 NEAR_PLANE = 0.05  # near plane: least distance from the camera at which discs are drawn
 DEPTH_BITS, ENTRY_BITS = 19, 24  # at most, of the 64 bits of a sort key; the bits above hold the pixel
 PIXEL_BITS = 64 - DEPTH_BITS - ENTRY_BITS  # if the depth has all its bits
@@ -86,13 +87,18 @@ class Entries(NamedTuple):
 
 
 def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
-    """Discs projected to a camera; back faces and discs behind the camera or outside the picture cover no pixel."""
+    """Discs projected to a camera; those behind it or outside the picture cover no pixel.
+
+    One-sided discs that are seen from behind are drawn with a facing of 0.02 (`layers.CONSTANTS.back_weight`), which is
+    better than a hole.
+    """
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     rotated = (rotate_columns(rotation, x) for x in (surfels.position, eye[None]))
     x, y, z = (there - here for there, here in zip(*rotated, strict=True))
     normal, rim = (rotate_columns(rotation, x) for x in (surfels.normal, surfels.rim_tangent))
     cosine = -dot(normal, (x, y, z)) / larger(safe_sqrt(dot((x, y, z), (x, y, z))), NEAR_PLANE)
-    facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine + 0.1) / 0.3))
+    begin, end = FACING_RAMP
+    facing = 1 - jnp.asarray(surfels.one_sided) * (1 - smoothstep((cosine - begin) / (end - begin)))
     ahead = larger(-z, NEAR_PLANE)
     column = camera.intrinsics[0, 0] * x / ahead + camera.intrinsics[0, 2]
     row = -camera.intrinsics[1, 1] * y / ahead + camera.intrinsics[1, 2]

@@ -60,7 +60,10 @@ RANDOM = Limits(fits=0.7, nearest=0.45, farthest=1.6, plate=1.5, most_points=819
 
 
 class Surface(NamedTuple):
-    """Points and unoriented unit normals in the box, their median spacing, neighbors, and the tree of the points."""
+    """Points and unoriented unit normals in the box; the limits of their kind; neighbors, and the tree of the points.
+
+    `spacing`, the unit of this file's lengths, is the median over points of the mean distance to six neighbors.
+    """
 
     position: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]

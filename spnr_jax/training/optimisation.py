@@ -230,7 +230,7 @@ def train_step(
 
 
 def moving_average(averaged: Any, newest: Any, step: Array, decay: float) -> Any:
-    """Moving average after a step.  Its memory grows from 0, because early weights are far from the last."""
+    """Moving average after a step.  Its memory grows from 0.1, because early weights are far from the last."""
     share = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
     return jax.tree.map(lambda old, new: share * old + (1 - share) * new, averaged, newest)
 
