@@ -27,7 +27,6 @@ from spnr_jax.surfels.splatting import RADIUS
 NUM_DIRECTIONS = 64
 CELL = 1.5  # width of a cell, in spacings
 STEEPEST = 8.0  # largest slope of a plane relative to the direction
-SOFTNESS = 1.0  # spacings behind the depth buffer over which visibility falls to 0
 COARSEST, FINEST = 256, 1024  # least and largest number of cells along a side
 BOX = 2.2  # side of the square that each buffer covers: the box's diagonal is 2
 
@@ -44,7 +43,10 @@ DIRECTIONS = spiral(NUM_DIRECTIONS)
 
 
 def choose_grid(count: int | Int[Array, ""]) -> Any:
-    """Cells along a side of the depth buffers for so many points: CELL spacings wide, if that covers the box."""
+    """Cells along a side of the depth buffers for so many points.
+
+    4 sqrt(count) cells of CELL spacings cover the box if the surface has an area of 0.13 (4 pi: the sphere around it).
+    """
     xp = array_namespace(count)
     return xp.clip(16 * xp.ceil(xp.sqrt(count) / 4), COARSEST, FINEST).astype(int)
 
@@ -63,43 +65,45 @@ def compute_visibility(
     *,
     grid: int,
 ) -> Float[Array, "64 points"]:
-    """Visibility of each point from each of DIRECTIONS: 1 in front of the depth buffer, 0 two spacings behind it.
+    """Visibility of each point from each of DIRECTIONS, by the formula at the top of this file.
 
     Constant for gradients, because a depth buffer jumps where one point passes in front of another.  The sign of a
     normal does not matter.
     """
     positions, normals, spacing, cell = jax.lax.stop_gradient((positions, normals, spacing, cell))
 
-    def number_of(column, row):  # counted from the middle, so that a larger grid rounds nothing otherwise
-        row, column = (jnp.clip(i + grid // 2, 0, grid - 1) for i in (row, column))
-        return row * grid + column
-
-    def beside(column, row, right, up, slopes):
-        """How much nearer a plane through (right, up), in cells, is at the centre of a cell."""
-        return cell * ((column + 0.5 - right) * slopes[0] + (row + 0.5 - up) * slopes[1])
-
     def look(axes):
         towards, right, up = axes
-        facing = dot(towards, normals)
-        steep = [-dot(axis, normals) * jnp.sign(facing) / jnp.maximum(jnp.abs(facing), 1e-3) for axis in (right, up)]
-        slope = jnp.sqrt(steep[0] ** 2 + steep[1] ** 2)
-        steep = [x * jnp.minimum(1, STEEPEST / jnp.maximum(slope, 1e-3)) for x in steep]
-        across, high = (dot(axis, positions) / cell for axis in (right, up))
-        column, row = (jnp.floor(v - 0.5).astype(jnp.int32) for v in (across, high))
-        depth = dot(towards, positions)
-        most = RADIUS * spacing * jnp.sqrt(jnp.clip(1 - facing**2, 0, 1))
-        nearest = jnp.full(grid * grid, -2 * BOX, depth.dtype)
+        cosine = dot(towards, normals)
+        slopes = [-dot(axis, normals) * jnp.sign(cosine) / jnp.maximum(jnp.abs(cosine), 1e-3) for axis in (right, up)]
+        steepness = jnp.sqrt(slopes[0] ** 2 + slopes[1] ** 2)
+        slopes = [x * jnp.minimum(1, STEEPEST / jnp.maximum(steepness, 1e-3)) for x in slopes]
+
+        def locate(points):
+            """Place of points in the picture, in cells from its middle, and their depth towards the viewer."""
+            return (dot(right, points) / cell, dot(up, points) / cell), dot(towards, points)
+
+        def depth_at(cells, place, depth):
+            """Depth of the points' planes at the centres of cells."""
+            return depth + cell * sum((c + 0.5 - x) * slope for c, x, slope in zip(cells, place, slopes, strict=True))
+
+        def number(cells):
+            column, row = (jnp.clip(c + grid // 2, 0, grid - 1) for c in cells)
+            return row * grid + column
+
+        place, depth = locate(positions)
+        first = [jnp.floor(x - 0.5).astype(jnp.int32) for x in place]
+        nearest_edge = depth + RADIUS * spacing * jnp.sqrt(jnp.clip(1 - cosine**2, 0, 1))
+        buffer = jnp.full(grid * grid, -2 * BOX, depth.dtype)  # behind everything
         for j, i in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            nearer = beside(column + i, row + j, across, high, steep)
-            there = depth + jnp.where(nearer < most, nearer, 0)
-            index = jnp.where(mask, number_of(column + i, row + j), grid * grid)
-            nearest = nearest.at[index].max(there, mode="drop")
-        lifted = positions + (jnp.sign(facing) * spacing)[None] * normals
-        across, high = (dot(axis, lifted) / cell for axis in (right, up))
-        column, row = (jnp.floor(v).astype(jnp.int32) for v in (across, high))
-        there = dot(towards, lifted) + beside(column, row, across, high, steep)
-        behind = (nearest[number_of(column, row)] - there) / jnp.maximum(spacing, cell / CELL)
-        return jnp.clip(1 - behind / SOFTNESS, 0, 1)
+            cells = [first[0] + i, first[1] + j]
+            there = depth_at(cells, place, depth)
+            there = jnp.where(there < nearest_edge, there, depth)  # the plane says nothing beyond the disc's edge
+            buffer = buffer.at[jnp.where(mask, number(cells), grid * grid)].max(there, mode="drop")
+        place, depth = locate(positions + (jnp.sign(cosine) * spacing)[None] * normals)
+        cells = [jnp.floor(x).astype(jnp.int32) for x in place]
+        behind = (buffer[number(cells)] - depth_at(cells, place, depth)) / jnp.maximum(spacing, cell / CELL)
+        return jnp.clip(1 - behind, 0, 1)
 
     right, up, towards = jnp.moveaxis(tangent_frame(jnp.asarray(DIRECTIONS.T, positions.dtype)), 2, 1)
     return jax.lax.map(look, (towards, right, up))
