@@ -15,12 +15,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, no_type_check
+from typing import ClassVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from experiments.baselines import ray_chunks
@@ -38,7 +37,7 @@ from spnr_jax.errors import require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.numerics import length, per_feature
-from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
+from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, record
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.nn.paper_layers import encode_direction, waves
 
@@ -137,8 +136,7 @@ def point_nerf_tiny() -> TrainConfig:
     )
 
 
-@no_type_check  # pytree transformations rebuild records with leaves that are no arrays
-@struct.dataclass
+@record
 class ViewRays:
     """Rays, and for each the axes of its camera as columns: offsets are seen from the world and from the camera."""
 
@@ -146,8 +144,7 @@ class ViewRays:
     axes: Float[Array, "*batch 3 3"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class ShadingPoints:
     """Where a ray is shaded; a ray with fewer than its share has them first, and the rest do not exist."""
 

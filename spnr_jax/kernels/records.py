@@ -6,7 +6,7 @@ sizes are static fields because they shape arrays.
 """
 
 import contextlib
-from typing import Any, no_type_check
+from typing import Any, dataclass_transform, no_type_check
 
 import jax
 import numpy as np
@@ -22,8 +22,33 @@ TABLES = (7, 32, 64, 3)  # shape of a light's tables
 LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
 
 
-@no_type_check  # pytree transformations rebuild records with leaves that are no arrays
-@struct.dataclass
+def register(kind: type) -> None:
+    """Lets `jax.export` write functions of a record; static fields are integers."""
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    with contextlib.suppress(ValueError):  # a module that is imported again: its first classes stay registered
+        if issubclass(kind, tuple):
+            export.register_namedtuple_serialization(kind, serialized_name=name)
+        else:
+            export.register_pytree_node_serialization(
+                kind,
+                serialized_name=name,
+                serialize_auxdata=lambda sizes: " ".join(map(str, sizes)).encode(),
+                deserialize_auxdata=lambda written: tuple(map(int, bytes(written).split())),
+            )
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
+def record(kind: type) -> Any:
+    """A frozen dataclass that is a pytree, and of which `jax.export` can write functions.
+
+    Its fields are not checked at run time: transformations rebuild records with leaves that are no arrays.
+    """
+    made = no_type_check(struct.dataclass(kind))
+    register(made)
+    return made
+
+
+@record
 class PointCloud:
     """Surface points of one object with their materials, padded to a fixed count; `mask` is True for real points."""
 
@@ -48,8 +73,7 @@ class PointCloud:
     """
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Camera:
     """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels.
 
@@ -62,8 +86,7 @@ class Camera:
     width: int = struct.field(pytree_node=False)
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Rays:
     """Half lines; `directions` have unit length, so distances along them are metric."""
 
@@ -71,8 +94,7 @@ class Rays:
     directions: Float[Array, "*batch 3"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Rendering:
     """The result of a rendering: `image` after the upsampler, the rest at the resolution of the volume rendering.
 
@@ -88,8 +110,7 @@ class Rendering:
     """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Scene:
     """An encoded object of a ray-marching network: the feature volume, and which of its voxels hold points."""
 
@@ -97,8 +118,7 @@ class Scene:
     occupied: Bool[Array, "*batch d d d"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Volume:
     """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
@@ -112,8 +132,7 @@ class Volume:
     """Voxels around points within which rays are sampled; follows from the point spacing."""
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Surfels:
     """Surface elements of one object (`surfels/geometry.py`): discs with materials.
 
@@ -148,8 +167,7 @@ class Surfels:
     mask: Bool[AnyArray, "*batch points"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class SurfelScene:
     """An encoded object of the surfel network; arrays only, so scenes of equally padded clouds can be stacked.
 
@@ -163,8 +181,7 @@ class SurfelScene:
     scale: Float[AnyArray, "*batch"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Light:
     """Distant light as tables by direction, all linear in the environment map (`surfels/lighting.py`).
 
@@ -222,8 +239,7 @@ def check_light(light: Light | None) -> None:
         raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 
 
-@no_type_check
-@struct.dataclass
+@record
 class GBuffer:
     """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes, 0 without discs.
 
@@ -251,8 +267,7 @@ class GBuffer:
     """Mean, by b_i, of the offset of the discs' centres from the pixel's centre, in pixels."""
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Batch:
     """One training batch: clouds of `objects`, and `views` of each with reference, opacity, and condition image."""
 
@@ -264,8 +279,7 @@ class Batch:
     condition_mask: Bool[AnyArray, "objects views height width"]
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Crops:
     """One training batch of the shader network: crops of G-buffers as network inputs (`nn/shader.py`).
 
@@ -281,8 +295,7 @@ class Crops:
     margin: int = struct.field(pytree_node=False, default=0)
 
 
-@no_type_check
-@struct.dataclass
+@record
 class Gaussians:
     """Gaussian splats of one object, as `spnr_jax/surfels/gaussians.py` makes them and splat viewers draw them.
 
@@ -297,25 +310,6 @@ class Gaussians:
     opacity: Float[AnyArray, " splats"]
     harmonics: Float[AnyArray, "splats coefficients 3"]
 
-
-def register(record: type) -> None:
-    """Lets `jax.export` write functions of a record; static fields are integers."""
-    name = f"{record.__module__}.{record.__qualname__}"
-    with contextlib.suppress(ValueError):  # a module that is imported again: its first classes stay registered
-        if issubclass(record, tuple):
-            export.register_namedtuple_serialization(record, serialized_name=name)
-        else:
-            export.register_pytree_node_serialization(
-                record,
-                serialized_name=name,
-                serialize_auxdata=lambda sizes: " ".join(map(str, sizes)).encode(),
-                deserialize_auxdata=lambda written: tuple(map(int, bytes(written).split())),
-            )
-
-
-_RECORDS: tuple[type, ...] = (PointCloud, Camera, Rays, Rendering, Scene, Volume, Surfels, SurfelScene, Light, GBuffer)
-for _record in (*_RECORDS, Batch, Crops, Gaussians):
-    register(_record)
 
 Key = jax.Array
 

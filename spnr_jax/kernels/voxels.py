@@ -18,18 +18,17 @@ gap, and a gap adds no interval length.  Outside the open cells, density is 0 by
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, no_type_check
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.devices.programs import object_groups
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp
-from spnr_jax.kernels.records import Rays
+from spnr_jax.kernels.records import Rays, record
 
 NEIGHBORS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
@@ -289,8 +288,7 @@ def find_corners(
 # --- empty space ------------------------------------------------------------------------------------------------------
 
 
-@no_type_check  # pytree transformations rebuild records with leaves that are no arrays
-@struct.dataclass
+@record
 class RayPath:
     """Cells along rays: their sorted `edges`, distances along the ray, and the open length up to each edge."""
 

@@ -57,7 +57,7 @@ class Footprints(NamedTuple):
 
     centre: tuple[Array, Array, Array]
     normal: tuple[Array, Array, Array]
-    rim_axes: tuple[Sequence[Array], Sequence[Array]]
+    rim_axes: tuple[Sequence[Array], Float[Array, "3 points"]]
     rim_distances: Sequence[Array]
     radius: Float[Array, " points"]
     facing: Float[Array, " points"]

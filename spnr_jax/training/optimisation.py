@@ -9,26 +9,24 @@ runs under vmap are computed one after the other.
 
 import dataclasses
 from functools import partial
-from typing import Any, no_type_check
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
-from spnr_jax.kernels.records import AnyArray, Batch, Key
+from spnr_jax.kernels.records import AnyArray, Batch, Key, record
 from spnr_jax.methods import method_of
 
 DiscriminatorState = tuple[dict, tuple]  # parameters and optimiser state of the discriminator
 
 
-@no_type_check
-@struct.dataclass
+@record
 class TrainState:
     """Everything that a step changes; data only.  `averaged` holds the moving averages that evaluation uses."""
 
