@@ -22,7 +22,7 @@ from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.surfel_renderer import Resolution, Sizes, make_scene
+from spnr_jax.method.surfel_renderer import Plan, make_scene
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
@@ -33,12 +33,11 @@ BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab
 
 
 class PlannedView(NamedTuple):
-    """A view with its light: the camera that is drawn (smaller for `balanced`), resolution and sizes."""
+    """A view with its light: the camera that is drawn (smaller for `balanced`), and the sizes that it needs."""
 
     camera: Camera
     light: Light
-    resolution: Resolution
-    needed: Sizes
+    needed: Plan
 
 
 def init(key: Key, config: SurfelConfig) -> dict:
@@ -96,14 +95,12 @@ def render(
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
     weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
-    common = {
-        resolution: surfel_renderer.max_sizes(x.needed for x in planned if x.resolution == resolution)
-        for resolution in {x.resolution for x in planned}
-    }
+    resolutions = {view.needed[:2] for view in planned}
+    plans = {of: surfel_renderer.merge_plans(x.needed for x in planned if x.needed[:2] == of) for of in resolutions}
 
     def draw(view: PlannedView, whole: Camera) -> Rendering:
         if view.needed.entries:
-            plan = surfel_renderer.round_sizes(common[view.resolution], view.resolution)
+            plan = plans[view.needed[:2]]
             window_buffer = _rasterize(volume.scene, view.camera, view.light, plan=plan)
             drawn = _shade(weights, volume.scene, view.camera, view.light, window_buffer, plan=plan)
         else:
@@ -122,7 +119,7 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
         )
     resolution = surfel_renderer.choose_resolution(scene, camera, render_scale)
     needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, **resolution._asdict()))
-    return PlannedView(camera, light or room_light(), resolution, needed)
+    return PlannedView(camera, light or room_light(), Plan(*map(int, needed)))
 
 
 @partial(CachedProgram, options=QUICKEST)

@@ -75,23 +75,14 @@ class Plan(NamedTuple):
     slots: int
 
 
+register(Plan)
+
+
 class Resolution(NamedTuple):
     """Resolution of the G-buffer: side / 2^doublings of the picture's (as in `Plan`)."""
 
     doublings: int
     side: int
-
-
-class Sizes(NamedTuple):
-    """Sizes that a picture needs: window width and height, entries, upper bound of covered pixels; arrays or ints."""
-
-    width: Any
-    height: Any
-    entries: Any
-    slots: Any
-
-
-register(Sizes)
 
 
 # --- scenes ---------------------------------------------------------------------------------------------------------
@@ -194,8 +185,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
     finest = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of.doublings, -of.side))
-    needed = jax.device_get([count_sizes(*pair, **finest._asdict()) for pair in pairs])
-    return round_sizes(max_sizes(needed), finest)
+    return merge_plans(jax.device_get([count_sizes(*pair, **finest._asdict()) for pair in pairs]))
 
 
 def check_camera(camera: Camera, where: str) -> None:
@@ -227,24 +217,24 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 
 
 @partial(CachedProgram, static=("doublings", "side"))
-def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
-    """The sizes that a view needs; the covered pixels are bounded by the rectangles around the discs."""
+def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Plan:
+    """What a view needs, as arrays; the covered pixels are bounded by the rectangles around the discs."""
     whole = scale_camera(scene, camera, doublings, side)
     foot = splatting.project_discs(scene.surfels, whole)
     _, width, height = place_window(foot)
     slots = splatting.bound_covered_pixels(foot, whole)
-    return Sizes(width, height, splatting.count_entries(foot.covered), slots)
+    sizes: Any = width, height, splatting.count_entries(foot.covered), slots
+    return Plan(doublings, side, *sizes)
 
 
-def max_sizes(needed: Iterable[Sizes]) -> Sizes:
-    """Sizes that suffice for each of several."""
-    return Sizes(*(max(map(int, sizes)) for sizes in zip(*needed, strict=True)))
+def merge_plans(counted: Iterable[Plan]) -> Plan:
+    """The plan that holds each of several views of one resolution.
 
-
-def round_sizes(sizes: Sizes, resolution: Resolution) -> Plan:
-    """The plan that holds these sizes; counts are rounded up to powers of the root of two, so that few are compiled."""
-    entries, slots = _round_count(sizes.entries, LEAST_ENTRIES), _round_count(sizes.slots, LEAST_SLOTS)
-    return Plan(*resolution, sizes.width, sizes.height, entries, min(slots, sizes.width * sizes.height))
+    Numbers of entries and slots are rounded up to powers of the root of two, so that few programs are compiled.
+    """
+    most = Plan(*(max(map(int, sizes)) for sizes in zip(*counted, strict=True)))
+    entries, slots = _round_count(most.entries, LEAST_ENTRIES), _round_count(most.slots, LEAST_SLOTS)
+    return most._replace(entries=entries, slots=min(slots, most.width * most.height))
 
 
 def _round_count(count: int, least: int) -> int:
