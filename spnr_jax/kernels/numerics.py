@@ -152,7 +152,7 @@ def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Vectors scaled to unit length; the zero vector stays zero with zero gradient."""
-    vectors = vectors / _largest(vectors)
+    vectors = vectors / _max_component(vectors)
     squared = jnp.sum(vectors**2, axis=-1, keepdims=True)
     valid = squared > 0
     return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
@@ -160,13 +160,13 @@ def normalize(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
 
 def length(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
     """Euclidean lengths; 0 with zero gradient for the zero vector."""
-    scale = _largest(vectors)
+    scale = _max_component(vectors)
     squared = jnp.sum((vectors / scale) ** 2, axis=-1)
     valid = squared > 0
     return jnp.where(valid, scale[..., 0] * jnp.sqrt(jnp.where(valid, squared, 1)), 0)
 
 
-def _largest(vectors):
+def _max_component(vectors):
     """Largest component of each vector (1 for the zero vector); vectors divided by it have squares in range.
 
     Constant for gradients: lengths and directions do not depend on the scale that they are computed at.
@@ -183,11 +183,11 @@ def per_feature(vector: Shaped[Array, " features"], like: Array) -> Shaped[Array
 # --- small systems, points last ---------------------------------------------------------------------------------------
 
 
-ROUND = 1e-4  # times the trace, added to variances before they are inverted
+RIDGE = 1e-4  # times the trace, added to variances before they are inverted
 SQUARINGS = 5  # M^(2^5): a ratio of eigenvalues of 1.1 becomes 1.1^32 = 21
-SHORTEST = 1e-9  # length of a vector that has a direction
-POINT = 1e-9  # least trace of a covariance with extent: gradients divide by its square, kept above 0
-SMALLEST = 1e-7  # times the trace: variances below are rounding
+LEAST_LENGTH = 1e-9  # length of a vector that has a direction
+LEAST_TRACE = 1e-9  # least trace of a covariance with extent: gradients divide by its square, kept above 0
+LEAST_VARIANCE = 1e-7  # times the trace: variances below are rounding
 
 
 def sum_first(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
@@ -273,10 +273,10 @@ def smallest(values: Float[Array, "k ..."]) -> Float[Array, "..."]:
     return -largest(-values)
 
 
-def unit(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
-    """Vectors scaled to length 1; 0 where they are shorter than SHORTEST, as the gradient would overflow."""
+def normalize_columns(vectors: Float[Array, "dimensions points"]) -> Float[Array, "dimensions points"]:
+    """Vectors scaled to length 1; 0 where they are shorter than LEAST_LENGTH, as the gradient would overflow."""
     squared = jnp.sum(vectors * vectors, axis=0, keepdims=True)
-    valid = squared > SHORTEST**2
+    valid = squared > LEAST_LENGTH**2
     return jnp.where(valid, vectors * jax.lax.rsqrt(jnp.where(valid, squared, 1)), 0)
 
 
@@ -309,10 +309,10 @@ def split_variances(
 ) -> tuple[Float[Array, "3 3 points"], Float[Array, "3 3 points"], Float[Array, "3 3 points"]]:
     """Covariances scaled to trace 1 (0 without extent), projections onto the narrowest and onto the widest axis."""
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    extended = trace > POINT
+    extended = trace > LEAST_TRACE
     scaled = jnp.where(extended[None, None], matrix / jnp.where(extended, trace, 1)[None, None], 0)
     ones = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype)[..., None], matrix.shape)
-    both = jnp.concatenate([solve(scaled + ROUND * ones, ones), scaled + ROUND * ones], axis=2)
+    both = jnp.concatenate([solve(scaled + RIDGE * ones, ones), scaled + RIDGE * ones], axis=2)
     narrowest, widest = jnp.split(project_largest(both), 2, axis=2)
     return scaled, narrowest, widest
 
@@ -321,7 +321,7 @@ def find_narrowest(matrix: Float[Array, "3 3 points"]) -> Float[Array, "3 points
     """Unit vectors, of either sign, along which points with these covariances have the least variance."""
     _, (x, y, z), _ = split_variances(matrix)
     last = jnp.where(y[1] > z[2], y, z)
-    return unit(jnp.where((x[0] > y[1]) & (x[0] > z[2]), x, last))
+    return normalize_columns(jnp.where((x[0] > y[1]) & (x[0] > z[2]), x, last))
 
 
 def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"]:
@@ -329,5 +329,5 @@ def measure_shape(matrix: Float[Array, "3 3 points"]) -> Float[Array, "2 points"
     scaled, narrowest, widest = split_variances(matrix)
     least, most = (jnp.sum(x * scaled, axis=(0, 1)) for x in (narrowest, widest))
     middle = scaled[0, 0] + scaled[1, 1] + scaled[2, 2] - least - most
-    ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), SMALLEST)
-    return safe_sqrt(jnp.where(jnp.stack([least, middle]) > SMALLEST, smaller(ratios, 1), 0))
+    ratios = jnp.stack([least, middle]) / larger(jnp.stack([middle, most]), LEAST_VARIANCE)
+    return safe_sqrt(jnp.where(jnp.stack([least, middle]) > LEAST_VARIANCE, smaller(ratios, 1), 0))

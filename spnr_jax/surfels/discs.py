@@ -17,13 +17,13 @@ from spnr_jax.kernels.numerics import (
     dot,
     larger,
     largest,
+    normalize_columns,
     safe_sqrt,
     smaller,
     smallest,
     solve,
     sum_first,
     sum_products,
-    unit,
 )
 from spnr_jax.surfels.layers import CONSTANTS, Neighborhood, project_on
 
@@ -160,7 +160,7 @@ def find_rims(
         jnp.where(cut, sum_first(jnp.where(first, components, 0)), of_turn[soonest])
         for components, of_turn in ((clip_lines.across, jnp.cos(turn)), (clip_lines.up, jnp.sin(turn)))
     ]
-    right, high = unit(jnp.stack(direction))
+    right, high = normalize_columns(jnp.stack(direction))
 
     def find_end(direction: tuple[Array, Array]) -> Array:
         right, high = direction
@@ -252,7 +252,7 @@ def _find_line(
         [jnp.stack([n, x, y, side[0]]), jnp.stack([x, xx, xy, side[1]]), jnp.stack([y, xy, yy, side[2]])]
     )
     stiff = jnp.asarray([1e-6, CONSTANTS.color_edge_ridge, CONSTANTS.color_edge_ridge], normal.dtype)
-    direction = unit(solve(normal[:, :3] + jnp.diag(stiff)[..., None], normal[:, 3:])[1:, 0])
+    direction = normalize_columns(solve(normal[:, :3] + jnp.diag(stiff)[..., None], normal[:, 3:])[1:, 0])
     height = jax.lax.optimization_barrier(uv[:, 0] * direction[0][None] + uv[:, 1] * direction[1][None])
     there = weight > CONSTANTS.color_edge_least_weight
     last = largest(jnp.where(there & ~beyond, height, 0))  # the point itself lies at 0

@@ -28,9 +28,9 @@ from spnr_jax.kernels.numerics import (
     clamp,
     dot,
     measure_shape,
+    normalize_columns,
     safe_sqrt,
     tangent_frame,
-    unit,
 )
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
@@ -66,7 +66,7 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> S
     def columns(values: AnyArray) -> Array:
         return layers.select(mask, jnp.asarray(values).T, 0)
 
-    normals = None if cloud.normals is None else unit(columns(cloud.normals))
+    normals = None if cloud.normals is None else normalize_columns(columns(cloud.normals))
     points = PointColumns(
         neighbors=layers.select(mask, jnp.asarray(neighbors).T, -1),
         mask=mask,

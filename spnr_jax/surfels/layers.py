@@ -21,11 +21,11 @@ from spnr_jax.kernels.numerics import (
     dot,
     find_narrowest,
     larger,
+    normalize_columns,
     solve,
     sum_first,
     sum_products,
     tangent_frame,
-    unit,
     with_gradient,
 )
 
@@ -248,14 +248,14 @@ def fit_planes(hood: Neighborhood, spacing: Float[Array, " block"]) -> Float[Arr
         across = cross(offset[one], offset[two])
         size = dot(across, across)
         spans = (size > CONSTANTS.least_plane_sine**2 * squared[one] * squared[two]) & (real[one] * real[two] > 0)
-        supported = jnp.where(spans, support(unit(across)), 0)
+        supported = jnp.where(spans, support(normalize_columns(across)), 0)
         better = supported > best[0]
         return (jnp.where(better, supported, best[0]), jnp.where(better[None], pair[:, None], best[1])), None
 
     none = jnp.zeros((2, len(spacing)), jnp.int32)
     _, chosen = jax.lax.scan(compare, (CONSTANTS.least_squares_bonus * support(constant), none), jnp.asarray(pairs))[0]
     one, two = (jnp.take_along_axis(hood.offset, which[None, None], axis=0)[0] for which in chosen)
-    return jnp.where(chosen[:1] > 0, unit(cross(one / spacing[None], two / spacing[None])), narrowest)
+    return jnp.where(chosen[:1] > 0, normalize_columns(cross(one / spacing[None], two / spacing[None])), narrowest)
 
 
 def init_normals(
@@ -355,7 +355,7 @@ def _fit_quadric(
         height = rest = up - slope[0][None] * one - slope[1][None] * two - sum(bent)
         if color_distance is not None:
             rest = height - solution[5][None] * color_distance
-        normal = unit(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
+        normal = normalize_columns(axes[2] - slope[:1] * axes[0] - slope[1:] * axes[1])
         away = sum_first(own * jnp.abs(rest)) / larger(sum_first(own) - 1, 0.5)  # the point itself is at 0
         thickness = clamp(CONSTANTS.thickness_per_deviation * away, least_thickness, CONSTANTS.thickness_bounds[1])
         return QuadricFit(Layer(normal, thickness, height), own, sums[:, :-1], solution[-1]), rest

@@ -69,7 +69,7 @@ def least_variance(arguments, outputs):
     """Along a unit vector that is nearly the narrowest axis; 0 where there is no extent."""
     matrix, axis = rows(np.float64(arguments[0])), rows(np.float64(outputs[0]))
     size = np.trace(matrix, axis1=1, axis2=2)
-    clear = size > 2 * numerics.POINT
+    clear = size > 2 * numerics.LEAST_TRACE
     close(np.linalg.norm(axis[clear], axis=1), np.ones(clear.sum()), atol=1e-5)
     found = np.einsum("ni,nij,nj->n", axis, matrix, axis)
     assert np.all(found <= 1.01 * np.linalg.eigvalsh(matrix)[:, 0] + 1e-5 * size + TINY)
@@ -102,7 +102,7 @@ SYSTEMS = (
     Law("sum_products and multiply", lambda a, b: (numerics.sum_products(a, b), numerics.multiply(a, b)),
         lambda a, b: (np.einsum("kip,kjp->ijp", a, b), np.einsum("ikp,kjp->ijp", a, b)),
         usual(lambda rng: tuple(rng.normal(size=(2, 3, 3, POINTS)))), shared=0),
-    Law("unit", numerics.unit, lambda v: v / np.linalg.norm(v, axis=0),
+    Law("unit", numerics.normalize_columns, lambda v: v / np.linalg.norm(v, axis=0),
         sizes("length", 1e-8, 1e10, lambda rng, v: (v * rng.uniform(0.5, 1, (3, POINTS)),)), shared=0),
     Law("find_narrowest", numerics.find_narrowest, None, (Axis("thickness", 0.1, 0.2, 0.3, covariances),),
         shared=0, extremes=Extremes((clouds,), floors=(FINITE,), check=least_variance, twin=False)),
@@ -176,7 +176,7 @@ def borders(place, colors):
     place = jnp.concatenate([0 * place[:1], place[1:]])
     one, up = jnp.ones_like(place[0, 0]), jnp.zeros_like(place[0, 0])
     axes = jnp.stack([jnp.stack([one, up, up]), jnp.stack([up, one, up]), jnp.stack([up, up, one])])
-    return tuple(discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors).values())
+    return discs.find_color_edge(place, jnp.ones_like(place[:, 0]), one, axes, colors)
 
 
 def parted(rng, size):
