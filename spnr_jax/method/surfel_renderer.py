@@ -43,8 +43,8 @@ from spnr_jax.kernels.records import (
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, ShaderInputs, compose_picture
 from spnr_jax.surfels import blending, lighting, splatting
+from spnr_jax.surfels.constants import NEIGHBORS
 from spnr_jax.surfels.geometry import estimate_surfels
-from spnr_jax.surfels.layers import NEIGHBORS
 from spnr_jax.surfels.neighbors import median
 from spnr_jax.surfels.splatting import MOST_ENTRIES, Footprints
 

@@ -50,6 +50,10 @@ INPUTS = {  # of the network; they do not depend on the light
     **{"normal": 3, "bent_normal": 3, "color": 3, "blended_color": 3, "drawn": 1, "sharp_weight": 1},
     **{"centre_offset": 2, "materials_unknown": 1, "learned": 1, "contrast": 1},
 }
+BLENDED = (  # the ATTRIBUTES that are INPUTS as they are
+    *("roughness", "metallic", "openness", "reflected", "shape_ratios", "one_sided", "bent_normal"),
+    *("materials_unknown", "learned"),
+)
 MAPS = {  # material and light maps that the outputs are factors of
     **{"color": 3, "metallic": 1, "opacity": 1, "factor": 1, "summand": 1},
     **{"irradiance": 3, "unshadowed": 3, "mirrored": 3, "reflected": 1},
@@ -148,7 +152,7 @@ def compute_inputs(buffer: GBuffer, light: Light, camera: Camera) -> ShaderInput
     inputs = {
         "opacity": buffer.opacity,
         "log_coverage": jnp.log1p(buffer.coverage),
-        **{name: of[name] for name in INPUTS.keys() & of.keys()},
+        **{name: of[name] for name in BLENDED},
         "depth_deviation": smaller(buffer.depth_deviation / spacing, 4),
         "relief": jnp.stack([_relief(buffer, spacing, reach) for reach in WINDOWS], axis=-1),
         "log_pixels": 0.5 * jnp.log(in_pixels),
@@ -156,7 +160,7 @@ def compute_inputs(buffer: GBuffer, light: Light, camera: Camera) -> ShaderInput
         "normal": buffer.normal,
         "color": linear_to_srgb(color),
         "blended_color": linear_to_srgb(blended),
-        "drawn": jnp.ones_like(drawn),
+        "drawn": jnp.ones_like(drawn),  # all are multiplied by it below
         "sharp_weight": jnp.log1p(8 * buffer.sharp_weight),
         "centre_offset": clamp(buffer.centre_offset / in_pixels[..., None], -2, 2),
         # standard deviation of the grey values of the blended colours

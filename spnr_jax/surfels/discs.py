@@ -25,7 +25,8 @@ from spnr_jax.kernels.numerics import (
     sum_first,
     sum_products,
 )
-from spnr_jax.surfels.layers import CONSTANTS, Neighborhood, project_on
+from spnr_jax.surfels.constants import CONSTANTS
+from spnr_jax.surfels.layers import Neighborhood, project_on
 
 NUM_RIM_DIRECTIONS = 16  # in which the rim of a layer is searched
 CHANGE, ROOTS, SPREAD = slice(6, 9), slice(9, 12), 12  # columns of a color edge's sums: moments of the colors

@@ -34,7 +34,8 @@ from spnr_jax.kernels.numerics import (
 )
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
 from spnr_jax.surfels import discs, layers, sides
-from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on
+from spnr_jax.surfels.constants import CONSTANTS
+from spnr_jax.surfels.layers import Layer, Neighborhood, project_on
 from spnr_jax.surfels.neighbors import measure_evenness, median
 from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 

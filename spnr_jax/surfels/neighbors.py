@@ -13,7 +13,7 @@ from spnr_jax.kernels import triangles
 from spnr_jax.kernels.cloud_arrays import check_cloud, refuse_tracers
 from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
-from spnr_jax.surfels.layers import NEIGHBORS
+from spnr_jax.surfels.constants import NEIGHBORS
 
 BLOCK = 2**14  # points per query of the k-d tree
 NEAREST = 32  # nearest points among which the neighbors of a point with a normal are chosen

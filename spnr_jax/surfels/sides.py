@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.kernels.numerics import array_namespace, clamp, dot, sum_first, tangent_frame
-from spnr_jax.surfels.layers import CONSTANTS, Layer, Neighborhood, project_on, weigh_distance, weigh_height
+from spnr_jax.surfels.constants import CONSTANTS
+from spnr_jax.surfels.layers import Layer, Neighborhood, project_on, weigh_distance, weigh_height
 from spnr_jax.surfels.splatting import RADIUS
 
 # --- visibility -------------------------------------------------------------------------------------------------------

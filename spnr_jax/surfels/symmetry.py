@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from spnr_jax.kernels.records import PointCloud
 from spnr_jax.kernels.triangles import unit
-from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.surfels.neighbors import measure_evenness, neighbors
 from spnr_jax.surfels.normals import estimate_normals
 from spnr_jax.surfels.sides import spiral

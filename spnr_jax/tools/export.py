@@ -51,7 +51,7 @@ from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.model import FIELD_OF_VIEW, Model
 from spnr_jax.method.surfel_renderer import Plan
 from spnr_jax.surfels import lighting
-from spnr_jax.surfels.layers import NEIGHBORS
+from spnr_jax.surfels.constants import NEIGHBORS
 from spnr_jax.surfels.sides import spiral
 from spnr_jax.tools import surfaces
 from spnr_jax.tools.commands import Export, Render, Share, require_drawable

@@ -45,7 +45,8 @@ from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader, ShaderInputs, compose_picture
-from spnr_jax.surfels import layers, lighting, normals, splatting
+from spnr_jax.surfels import lighting, normals, splatting
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.training.batching import read_ahead
 from spnr_jax.training.scan_faults import drop_materials, random_scan
 from spnr_jax.training.weights import add_companions
@@ -150,7 +151,7 @@ def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict)
     """A checksum of everything but object and cloud that G-buffers are made of."""
     names = "seed", "min_points", "max_points", "even_share", "views_per_object"
     chosen = [getattr(config, x) for x in names]
-    numbers = dataclasses.astuple(layers.CONSTANTS), list(shader.INPUTS.items()), list(shader.MAPS.items())
+    numbers = dataclasses.astuple(CONSTANTS), list(shader.INPUTS.items()), list(shader.MAPS.items())
     made_of = hashlib.sha256(json.dumps([chosen, dataset.settings, numbers]).encode())
     for leaf in jax.tree.leaves((light, variables)):
         made_of.update(np.asarray(leaf).tobytes())

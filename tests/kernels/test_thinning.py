@@ -14,7 +14,7 @@ from spnr_jax.kernels.cloud_arrays import (
     sample_stream,
     stack_columns,
 )
-from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.surfels.neighbors import measure_evenness, neighbors
 
 

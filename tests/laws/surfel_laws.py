@@ -20,7 +20,7 @@ from spnr_jax.kernels import numerics
 from spnr_jax.kernels.records import Light
 from spnr_jax.nn import shader
 from spnr_jax.surfels import blending, discs, layers, lighting
-from spnr_jax.surfels.layers import CONSTANTS, NEIGHBORS
+from spnr_jax.surfels.constants import CONSTANTS, NEIGHBORS
 
 POINTS = 16
 NUM_MAPS = 17  # of a pixel, for the shader

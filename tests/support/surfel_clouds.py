@@ -7,8 +7,8 @@ import numpy as np
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import pad
 from spnr_jax.kernels.records import Camera, PointCloud, Surfels
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.surfels.geometry import estimate_surfels
-from spnr_jax.surfels.layers import CONSTANTS
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.sides import NUM_DIRECTIONS, spiral
 

@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 from support.surfel_clouds import cloud, estimate, even_square, shape
 
 from spnr_jax.surfels import discs
-from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.surfels.neighbors import neighbors
 
 ACROSS, AT = np.array([0.8, 0.6]), 0.1

@@ -7,7 +7,7 @@ from support.laws import close
 from support.surfel_clouds import estimate, even_square, shape, tangents
 
 from spnr_jax.kernels.cloud_arrays import farthest_points
-from spnr_jax.surfels.layers import CONSTANTS
+from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.surfels.splatting import RADIUS
 
 CASES = [

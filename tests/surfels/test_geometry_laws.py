@@ -13,7 +13,7 @@ from support.surfel_clouds import cloud, lumpy_ball, shape
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import normalization, pad
 from spnr_jax.method import surfel_method, surfel_renderer
-from spnr_jax.surfels.layers import NEIGHBORS
+from spnr_jax.surfels.constants import NEIGHBORS
 
 COUNT, SIZE = 150, 160  # real points, and with padding
 ball = functools.cache(functools.partial(lumpy_ball, COUNT, SIZE))
