@@ -145,9 +145,12 @@ def include(source: Path | str) -> None:
             _import_file(location) if isinstance(location, Path) else importlib.import_module(location)
     except Exception as error:  # whatever a person's module raises
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from error
-    known = METHODS.keys() - before or any(m.source.startswith(name) for m in METHODS.values())
-    require(bool(known), f"--methods {name}: it registers no method; call spnr_jax.methods.register there")
-    for method in METHODS.keys() - before:
+    registered = METHODS.keys() - before
+    known = any(m.source.startswith(name) for m in METHODS.values())
+    require(
+        bool(registered) or known, f"--methods {name}: it registers no method; call spnr_jax.methods.register there"
+    )
+    for method in registered:
         METHODS[method] = dataclasses.replace(METHODS[method], source=name)
     _included[name] = location
 

@@ -12,6 +12,7 @@ With cached traces (`CachedProgram`), a new process neither traces nor compiles.
 import contextlib
 import functools
 import hashlib
+import inspect
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -94,20 +95,18 @@ DIGEST = hashlib.sha256().digest_size
 
 
 class CachedProgram:
-    """A function under `jax.jit` whose traces are cached; calls with tracers or sharded arrays bypass the cache."""
+    """A function under `jax.jit` whose traces are cached; its keyword-only arguments are static.
+
+    Calls with tracers or sharded arrays bypass the cache.
+    """
 
     instances: ClassVar[list[Self]] = []
 
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        *,
-        static: str | tuple[str, ...] = (),
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        """`static`: static keyword arguments; `options`: XLA's."""
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
+        """`options` are XLA's."""
         functools.update_wrapper(self, function)
         self.function, self.options = function, options
+        static = [name for name, x in inspect.signature(function).parameters.items() if x.kind is x.KEYWORD_ONLY]
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self.programs: dict[Any, Callable[..., Any]] = {}
         CachedProgram.instances.append(self)

@@ -18,7 +18,7 @@ from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
-TABLES = (7, 32, 64, 3)  # shape of a light's tables
+TABLES = (7, 32, 64, 3)  # shape of a light's tables: irradiance, then a map for each of 6 roughnesses
 LARGEST_REACH = 4  # upper bound of the distance from points, in voxels, at which rays are sampled
 
 

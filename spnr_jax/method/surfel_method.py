@@ -63,11 +63,11 @@ def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScen
     `least` or more.
     """
     real = cloud_arrays.strip(cloud)
-    real = jax.tree.map(np.float32, real).replace(mask=real.mask)
+    real = jax.tree.map(lambda x: np.asarray(x, np.float32), real).replace(mask=real.mask)
     order, near = order_in_space(real.positions, real.normals)
     size = cloud_arrays.bucket(len(order), least)
-    neighbors = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
-    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), neighbors)
+    near = np.pad(near, [(0, size - len(order)), (0, 0)], constant_values=-1)
+    return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), near)
 
 
 def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
@@ -128,8 +128,8 @@ def _encode(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> SurfelScen
 
 
 _densify = CachedProgram(densifier.densify_in_box, options=QUICKEST)
-_rasterize = CachedProgram(surfel_renderer.rasterize_window, static="plan")
-_shade = CachedProgram(surfel_renderer.shade_window, static="plan", options=QUICKEST)
+_rasterize = CachedProgram(surfel_renderer.rasterize_window)
+_shade = CachedProgram(surfel_renderer.shade_window, options=QUICKEST)
 _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 

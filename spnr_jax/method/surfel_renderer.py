@@ -12,7 +12,6 @@ compiled once.
 
 import dataclasses
 from collections.abc import Iterable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -206,7 +205,8 @@ def check_camera(camera: Camera, where: str) -> None:
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> Resolution:
     """The resolution for the scene's spacing in pixels at its centre, which counts as not nearer than NEAREST.
 
-    `render_scale` is the share of the pixels along a side that is drawn: the result holds for the smaller picture.
+    `render_scale` is the share of the pixels along a side of a picture that the camera draws; the picture as a whole
+    determines the resolution.
     """
     eye = np.asarray(camera.cam_to_world, np.float64)[:, 3]
     distance = float(np.linalg.norm((eye - np.asarray(scene.centre)) * np.asarray(scene.scale)))
@@ -216,7 +216,7 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
     return Resolution(doublings, 2 if pixels < finest else 1)
 
 
-@partial(CachedProgram, static=("doublings", "side"))
+@CachedProgram
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Plan:
     """What a view needs, as arrays; the covered pixels are bounded by the rectangles around the discs."""
     whole = scale_camera(scene, camera, doublings, side)

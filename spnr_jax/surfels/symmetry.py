@@ -155,7 +155,7 @@ def find_planes(surface: Surface) -> list[Plane]:
     for normal in normals[np.argsort(score, kind="stable")]:
         if len(refined) < REFINED and all(abs(normal @ other) < DISTINCT for other in refined):
             refined.append(normal)
-    planes = [register(surface, normal, float(centroid @ normal)) for normal in refined]
+    planes = [register_plane(surface, normal, float(centroid @ normal)) for normal in refined]
     return sorted(
         (x for x in planes if x.share > LEAST_SHARE and not halves_plate(surface, x)), key=lambda x: x.distance
     )
@@ -167,7 +167,7 @@ def halves_plate(surface: Surface, plane: Plane) -> bool:
     return bool(np.quantile(distance, 0.9) < surface.limits.plate * surface.spacing)
 
 
-def register(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
+def register_plane(surface: Surface, normal: Float[np.ndarray, "3"], offset: float) -> Plane:
     """The plane after point-to-plane registration of the reflected points to the cloud, robustly weighted."""
     chosen = slice(None, None, -(-len(surface.position) // REGISTERING))
     position = surface.position[chosen]
