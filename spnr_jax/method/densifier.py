@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Int
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import AnyArray, PointCloud
-from spnr_jax.method.surfel_renderer import check_inputs, normalise_cloud
+from spnr_jax.method.checks import check_neighbors
+from spnr_jax.method.surfel_renderer import normalise_cloud
 from spnr_jax.nn.point_prediction import LearnedPoints, predict, weigh_rows
 from spnr_jax.surfels.candidates import CANDIDATES, Candidates, Nodes, build_graph
 from spnr_jax.surfels.neighbors import measure_evenness
@@ -39,7 +40,7 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
     """
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
-    check_inputs(cloud, neighbors, "densify")
+    check_neighbors(cloud, neighbors, "densify")
     inside, centre, scale = normalise_cloud(cloud)
     dense = densify_in_box(params["densifier"], inside, neighbors)
     learned = dense.positions[len(cloud.mask) :] / scale + centre[None]

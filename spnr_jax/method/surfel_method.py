@@ -22,6 +22,7 @@ from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
 from spnr_jax.method import densifier, surfel_renderer
+from spnr_jax.method.checks import check_camera
 from spnr_jax.method.surfel_renderer import Plan, make_scene
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
@@ -112,7 +113,7 @@ def render(
 
 def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_scale: float) -> PlannedView:
     """A view prepared for drawing, with this share of its pixels along a side, and the sizes that it needs."""
-    surfel_renderer.check_camera(camera, "render")
+    check_camera(camera, "render")
     if render_scale != 1:
         camera = cameras.resize(
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))

@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float, Int
 from spnr_jax.devices.programs import CachedProgram
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.cloud_arrays import check_cloud
 from spnr_jax.kernels.imaging import WHITE, average_pool, double_size
 from spnr_jax.kernels.numerics import clamp, larger, largest, length, smallest
 from spnr_jax.kernels.records import (
@@ -34,15 +33,13 @@ from spnr_jax.kernels.records import (
     Rendering,
     Surfels,
     SurfelScene,
-    check_camera_kind,
-    check_light,
     register,
     unstack,
 )
+from spnr_jax.method.checks import check_camera, check_neighbors, check_scene, check_view
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import NUM_OUTPUTS, Shader, ShaderInputs, compose_picture
 from spnr_jax.surfels import blending, lighting, splatting
-from spnr_jax.surfels.constants import NEIGHBORS
 from spnr_jax.surfels.geometry import estimate_surfels
 from spnr_jax.surfels.neighbors import median
 from spnr_jax.surfels.splatting import MOST_ENTRIES, Footprints
@@ -96,25 +93,11 @@ def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]
     scene's centre.  The docstring of `surfels/geometry.py` lists what has no gradient.
     """
     del params
-    check_inputs(cloud, neighbors, "encode")
+    check_neighbors(cloud, neighbors, "encode")
     # a cloud that a jitted function closes over is constant: XLA would take seconds to sort it while compiling
     cloud, neighbors = jax.lax.optimization_barrier((cloud, neighbors))
     inside, centre, scale = normalise_cloud(cloud)
     return make_scene(inside, neighbors, centre, scale)
-
-
-def check_inputs(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], where: str) -> None:
-    """ValueError, which names the function and the argument, for arrays that do not fit each other."""
-    check_cloud(cloud, where)
-    if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
-        found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
-        raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
-    if not isinstance(neighbors, jax.core.Tracer):
-        values = np.asarray(neighbors)
-        low, high = values.min(initial=-1), values.max(initial=-1)
-        if not np.issubdtype(values.dtype, np.integer) or low < -1 or high >= len(cloud.mask):
-            found = f"are {values.dtype} from {low} to {high}, expected indices of {len(cloud.mask)} points, or -1"
-            raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
 
 
 def normalise_cloud(cloud: PointCloud) -> tuple[PointCloud, Float[Array, "3"], Float[Array, ""]]:
@@ -169,7 +152,7 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     cameras have the axes (*scenes, *views), or none: one camera for all.  ValueError if a picture needs more entries
     than can be sorted.
     """
-    _check_scene(scene, "plan")
+    check_scene(scene, "plan")
     cloud_arrays.refuse_tracers(scene, "plan")
     check_camera(camera, "plan")
     batch = np.shape(camera.cam_to_world)[:-2]
@@ -185,21 +168,6 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
     finest = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of.doublings, -of.side))
     return merge_plans(jax.device_get([count_sizes(*pair, **finest._asdict()) for pair in pairs]))
-
-
-def check_camera(camera: Camera, where: str) -> None:
-    """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
-    check_camera_kind(camera)
-    cloud_arrays.refuse_tracers(camera, where)
-    tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
-    if tails != [(3, 4), (3, 3)]:
-        raise UserError(f"{where}: expected a pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
-        raise UserError(f"{where}: the camera's pose or intrinsics hold NaN or infinity")
-    if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
-        raise UserError(f"{where}: a focal length of camera.intrinsics is 0 or negative; expected pixels")
-    if not cameras.is_rotation(np.asarray(camera.cam_to_world)[..., :3]):
-        raise UserError(f"{where}: camera.cam_to_world is no rotation; was `up` along the view, or the pose scaled?")
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> Resolution:
@@ -289,37 +257,20 @@ def render(
     the cut after 24 entries.  Where one of these changes, where a normal turns away from the camera, and at the kinks
     of clipped values, the picture is only piecewise smooth.
     """
-    _check(params, scene, camera, light, plan)
+    check_view(params, scene, camera, light)
+    _check_plan(plan)
     light = lighting.room_light() if light is None else light
     window_buffer = rasterize_window(scene, camera, light, plan=plan)
     return shade_window(params, scene, camera, light, window_buffer, plan=plan)
 
 
-def _check(params: dict | None, scene: SurfelScene, camera: Camera, light: Light | None, plan: Plan) -> None:
-    """ValueError in one line if there is not exactly one object, one view and one light."""
-    check_light(light)
-    check_camera_kind(camera)
-    _check_scene(scene, "render")
-    for what, array, wanted in (
-        ("camera.cam_to_world", camera.cam_to_world, (3, 4)),
-        ("camera.intrinsics", camera.intrinsics, (3, 3)),
-        ("scene.centre", scene.centre, (3,)),
-        ("scene.surfels.position", scene.surfels.position, (*np.shape(scene.surfels.mask), 3)),
-    ):
-        if np.shape(array) != wanted:
-            raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
-    if params is not None and "params" not in params:
-        raise UserError(f"render: expected params=model.params, or None; got a dict of {', '.join(params)}")
+def _check_plan(plan: Plan) -> None:
+    """ValueError in one line for what is no plan."""
     if any(isinstance(size, jax.core.Tracer) for size in jax.tree.leaves(plan)):
         raise UserError("render: plan is traced, but gives array sizes: jax.jit(render, static_argnames='plan')")
     check_kind(plan, Plan, "render: expected plan=spnr_jax.plan(scene, camera)")
     if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
-
-
-def _check_scene(scene: SurfelScene, where: str) -> None:
-    """ValueError unless it is a scene."""
-    check_kind(scene, SurfelScene, f"{where}: expected a scene of spnr_jax.encode, or volume.scene")
 
 
 class WindowBuffer(NamedTuple):
