@@ -30,14 +30,17 @@ Report = Callable[[str], None]
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-# ignored in names: CloudCompare's prefix, separators, British spelling, and words such as `vertex`
-SILENT = re.compile(r"^scalar_|[\s.:_-]+|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)")
+# ignored in names: CloudCompare's prefix, separators, umlauts, British spelling, and words such as `vertex`
+SILENT = re.compile(
+    r"^scalar_|[\s.:_-]+|[^\x00-\x7f]|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
+)
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
 PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
 PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
-HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "höhe", "hoehe", "cota")
+HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "hhe", "hoehe", "cota")  # hhe: Höhe
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
+COLORS = "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb|rot grn blau|rot gruen blau|rouge vert bleu|rojo verde azul"
 ALIASES = {  # our names -> groups of names in files, without separators; the first complete group is taken
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
@@ -45,7 +48,7 @@ ALIASES = {  # our names -> groups of names in files, without separators; the fi
     for ours, stems, others in (
         (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
         (LINEAR, "basecolor albedo cd", "linearr linearg linearb|linearred lineargreen linearblue"),  # Houdini: Cd
-        (SRGB, "color colors rgb rgbs diffuse vertex", "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb"),
+        (SRGB, "color colors rgb rgbs diffuse vertex", COLORS),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
@@ -62,6 +65,7 @@ NAMES = {name for group in ALIASES.values() for names in group for name in names
 ARRAYS = {name.removesuffix("0") for name in NAMES}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # prefixes
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
+PROPERTIES = ("roughness", "metallic")
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
@@ -192,8 +196,9 @@ def invisible(columns: Columns) -> np.ndarray:
     values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
     low, high = values.min(initial=0), values.max(initial=0)
     if "splat_opacity" in columns or low < 0:
-        # logits, as Kerbl et al. write them, unless all are 0 to 1
-        return values < (FOG if low >= 0 and high <= 1 else np.log(FOG / (1 - FOG)))
+        # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes
+        white = 255 if high > 1 and not (values % 1).any() else 1
+        return values < (FOG * white if low >= 0 and high <= white else np.log(FOG / (1 - FOG)))
     if "alpha" not in columns and "rgba" in columns:
         columns["alpha"] = _unpack(columns["rgba"])[:, 3]
     values = columns.get("alpha", columns.get("opacity", nothing))
@@ -208,7 +213,7 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
     If the file has neither roughness nor metallic, also `materials_known` (points,), all 0.
     """
     count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
-    found |= {name: _unit_interval(columns[name], name) for name in ("roughness", "metallic") if name in columns}
+    found |= {name: _unit_interval(columns[name], name, report) for name in PROPERTIES if name in columns}
     complete = {} if len(found) > 1 else {"materials_known": np.zeros(count)}
     for name, default in DEFAULTS.items():
         if (values := found.get(name)) is None:
@@ -251,9 +256,13 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     return srgb_to_linear(np.repeat(grey[:, None], 3, axis=-1))
 
 
-def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
-    """Roughness or metallic in [0, 1], without rounding errors; ValueError if they lie outside."""
-    scaled = values / full_scale(values.dtype, float(values.max(initial=0)), linear=True)
+def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
+    """Roughness or metallic in [0, 1] or of whole bytes, without rounding errors; ValueError if they lie outside."""
+    highest = float(values.max(initial=0))
+    scale = full_scale(values.dtype, highest, linear=highest <= 100 or bool((values % 1).any()))
+    if scale > 1:
+        report(f"{name} taken to be in 0..{scale:g}")
+    scaled = values / scale
     if not (scaled.min() >= -ROUNDING and scaled.max() <= 1 + ROUNDING):
         raise UserError(f"has {name} from {scaled.min():g} to {scaled.max():g}; expected 0 to 1")
     return np.clip(scaled, 0, 1)

@@ -58,6 +58,8 @@ def load_mesh(
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
         parts = READERS[kind](path, loading)
+        if parts and not any(len(part.positions) for part in parts):
+            raise UserError("has no faces, and no vertices")
         for part in parts:
             _check_columns(part)
         if loading.strict or not parts or any(len(part.faces) for part in parts):

@@ -1,8 +1,9 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
-Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
-or if something else separates the numbers.  Lines of a single integer are counts of points.  A
-header line, also one after #, % or //, names the columns; columns without a name, and columns of words, are not read.
+Separators are commas, semicolons, bars or blanks, also at the end of a line; brackets around a row, and separators of
+thousands, are dropped.  A comma is a decimal one inside quotes, or if something else separates the numbers.  Lines of a
+single integer are counts of points.  A header line, also one after #, % or //, names the columns; columns without a
+name, and columns of words other than #rrggbb, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 
     .npz    named arrays (points, c) or (points,); an array of positions may have more columns, as in text
@@ -51,11 +52,15 @@ PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text, and of an array, in memory a
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line shown in errors, and searched for names
 MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names; columns of an unnamed table
 COMMENTS = ("#", "//", "%")
-NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)([ed][+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+# separators of thousands, if a semicolon separates the numbers, and if not; the last mark in 1.234,5 is the decimal one
+THOUSANDS = (re.compile(r"(?<=\d)(['’\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’](?=\d{3})"))
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a missing number
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
+FORTRAN, WHOLE = re.compile(r"(?<=[\d.])d(?=[+-]?\d)", re.IGNORECASE), re.compile(r"\.0+(?![\d.ed])", re.IGNORECASE)
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
 INDEX = "index"  # name of a column that is not used
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can declare any size
@@ -66,11 +71,12 @@ UNNAMED = tuple(f"arr{i}" for i in range(9))  # np.savez's names of arrays passe
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; a line above the numbers may name them."""
     with open_text(path) as file:
-        numbered = ((number, _unquote(line.strip().replace("|", ";"))) for number, line in enumerate(file, 1))
+        numbered = ((number, _plain(line)) for number, line in enumerate(file, 1))
         before, first = _split_header(numbered)
         if not first[1]:
             remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
-            raise UserError(f"holds 0 points: no row of numbers, only {remark[:SHOWN]!r}")
+            wanted = "expected rows of numbers, with a line of names above them if they begin with words"
+            raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
         parts = first[1].split()
         if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
@@ -91,13 +97,14 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         names: tuple[str, ...] = ()
         found = 0
         words = [word.replace(",", ".") for word in first[1].split(delimiter)]
-        unread = {i: lambda word: np.nan for i, word in enumerate(words) if not _is_number(word)}
+        unread = {i: _packed_color for i, word in enumerate(words) if not _is_number(word)}
         while rows := list(islice(lines, PIECE_LINES)):
             found += len(rows)
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             names = names or _names(before, table, path.suffix.lower(), report)
             if {names[i] for i in unread} & {*"xyz", *COLOR}:
                 raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+            names = tuple("rgb" if PACKED.fullmatch(word) else name for name, word in zip(names, words, strict=True))
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -118,15 +125,25 @@ def encoding_of(head: bytes) -> str:
     return "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
-def _unquote(text: str) -> str:
-    """The line without quotes; commas inside quotes are decimal ones."""
-    return re.sub('"([^"]*)"?', lambda found: found[1].replace(",", "."), text) if '"' in text else text
+def _plain(line: str) -> str:
+    """The line without brackets, quotes and separators of thousands; commas inside quotes are decimal ones."""
+    text = line.strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
+    if text[:1] in ("[", "(", "{"):
+        text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
+    if '"' in text:
+        text = re.sub('"([^"]*)"?', lambda found: THOUSANDS[0].sub("", found[1]).replace(",", "."), text)
+    return THOUSANDS[";" not in text].sub("", text)
 
 
 def _words(line: str) -> list[str]:
     """The fields of a line."""
     mark = next((mark for mark in ";," if mark in line), None)
     return [word.strip("' \t") for word in (line.split(mark) if mark or "\t" not in line else re.split(r"\t+", line))]
+
+
+def _packed_color(word: str) -> float:
+    """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
+    return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:
@@ -162,7 +179,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
-    texts = [UNDEFINED.sub("nan", text) for text in texts]
+    texts = [FORTRAN.sub("e", WHOLE.sub("", UNDEFINED.sub("nan", text))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)
     for (number, text), plain in zip(rows, texts, strict=True):
@@ -185,7 +202,8 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
             names = text.lower().split()
         while len(names) > filled and not names[-1]:
             names.pop()
-        is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
+        # V1, V2 ... of R and Matlab name nothing
+        is_remark = line.startswith(COMMENTS) or NUMBER.match(line) or len({re.sub(r"\d", "", x) for x in names}) == 1
         if filled <= len(names) <= count and (name_places(names) or not is_remark):
             found.append(names)
         elif "x" in names and not is_remark:
@@ -221,7 +239,8 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
     first = 2 if pictured else int(timed or np.all(steps == 1))
     if first and count - first != 5:  # five columns after it: x of a profile, then y z r g b
         report(
-            f"columns before x y z, which number or time the points: {first} (if not, name the columns in a first line)"
+            f"columns before x y z, which number or time the points: {first}; "
+            "if that is wrong, or y comes before x, name the columns in a first line"
         )
         return (*first * [INDEX], *plain_names(table[:, first:], report))
     if (known := np.isfinite(table).all(axis=1)).any():
@@ -242,7 +261,8 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         if left == 2 and share:
             names[-2:] = "roughness", "metallic"
     if names[3:4] == ["scalar"]:
-        names[3] = "intensity"
+        packed = count == 4 and whole[3] and OPAQUE[-1] < np.median(table[:, 3]) <= table[:, 3].max() < 2**24
+        names[3] = "rgb" if packed else "intensity"
     if count > 3:
         others = [f"; r g b may as well be columns {i + 1} to {i + 3}: name them in a first line" for i in close[:1]]
         report(f"the {count} columns, which have no names, taken as {' '.join(names)}{''.join(others)}")

@@ -154,6 +154,7 @@ class Header(NamedTuple):
     textures: tuple[str, ...] = ()  # file names in MeshLab's comments
     organised: bool = False  # one point per pixel of a depth camera
     sensor: tuple[float, ...] | None = None  # its position; often 0 0 0 if unknown
+    carriage: bool = False  # lines of a text end in a bare \r
 
     @property
     def faces(self) -> str | None:
@@ -198,6 +199,7 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
 def element_pieces(file: BufferedIOBase, header: Header, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
     """(name, columns, lists) of the wanted elements of a PLY file at its data, in file order, some rows at a time."""
     left = set(wanted)
+    file = BytesIO(file.read().replace(b"\r", b"\n")) if header.carriage else file
     for name, count, properties in header.elements:
         for columns, lists in read_rows(file, count, properties, header.encoding == "ascii") if left else ():
             if name in left:
@@ -237,16 +239,16 @@ def _ply_header(file: BufferedIOBase) -> Header:
     textures: list[str] = []
     elements: list[tuple[str, int, Properties]] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
-        match line.split():
+        match line.lower().split():
             case ["format", name, _]:
                 order = BYTE_ORDERS.get(name)
             case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), []))
             case ["property", "list", length, items, name] if elements and {length, items} <= TYPES.keys():
-                elements[-1][2].append((name.lower(), TYPES[items], TYPES[length]))
+                elements[-1][2].append((name, TYPES[items], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1][2].append((name.lower(), TYPES[kind], 1))
-            case ["comment", "TextureFile", *_]:
+                elements[-1][2].append((name, TYPES[kind], 1))
+            case ["comment", "texturefile", *_]:
                 textures.append(line.split(None, 2)[-1].strip())
             case [] | ["comment" | "obj_info", *_]:
                 pass
@@ -258,7 +260,8 @@ def _ply_header(file: BufferedIOBase) -> Header:
     for _, _, own in elements:  # "float" in ASCII is read as f8: the text may have more digits
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
         own[:] = [(name, kind.replace("=f4", "=f8"), width) for name, kind, width in own]
-    return Header("ascii" if order == "=" else "binary", elements, tuple(textures))
+    text = order == "="
+    return Header("ascii" if text else "binary", elements, tuple(textures), carriage=text and newline[0] == b"\r")
 
 
 def _pcd_header(file: BufferedIOBase) -> Header:
@@ -272,7 +275,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
         if word not in ENTRIES and not word.startswith("#"):
             raise UserError(f"has a PCD header line that is not understood: {line.strip()!r}")
         entries[word] = values
-    if (encoding := end[1].decode("ascii", "replace")) not in ENCODINGS:
+    if (encoding := end[1].decode("ascii", "replace").lower()) not in ENCODINGS:
         raise UserError(f"has PCD data of kind {encoding!r}; expected one of {', '.join(ENCODINGS)}")
     try:
         names = entries["FIELDS"]

@@ -74,7 +74,8 @@ ROWS = [(*point, *GREEN) for point in BALL.tolist()]
 
 
 def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
-    text = "\n".join(separator.join(f"{value:.9g}" for value in row) + end for row in columns) + "\n"
+    rows = [[value if isinstance(value, str) else f"{value:.9g}" for value in row] for row in columns]
+    text = "\n".join(separator.join(row) + end for row in rows) + "\n"
     return text.replace(".", ",") if comma else text
 
 
@@ -88,9 +89,14 @@ PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for ro
 PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
 WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
-PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ascii\n"
+PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROWS]
+GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
+LOUD = ply_bytes("ascii", rows=[(*row[:3], 40.0, 170.0, 60) for row in ROWS], properties=XYZRGB).replace(
+    b"float", b"Float"
+)
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
@@ -115,6 +121,17 @@ TEXTS = {
     "names of a map behind a mark": ("a.txt", "#N,E,Elev,R,G,B\n" + table(",", columns=NORTHING)),
     "tabs that align": ("a.txt", "x\t\ty\tz\t\tr\tg\tb\n" + table("\t")),
     "tabs and blanks": ("a.txt", "x y z\tr g b\n" + table(" ")),
+    "names in German, as Excel writes them": ("a.csv", GERMAN.encode("cp1252")),
+    "names by number, of R and Matlab": ("a.txt", "V1 V2 V3 V4 V5 V6\n" + table(" ")),
+    "brackets around each row": ("a.txt", "[[" + table(", ").replace("\n", "],\n[")),
+    "thousands, Swiss": ("a.txt", table(" ", columns=THOUSANDS).replace(",", "'")),
+    "thousands, German": ("a.txt", table(";", columns=THOUSANDS).translate({44: ".", 46: ","})),
+    "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
+    "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
+    "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
+    "numbers of Fortran": ("a.txt", table(" ").replace(" ", "D+00 ")),
+    "minus signs": ("a.txt", table(" ").replace("-", "\N{MINUS SIGN}")),
+    "names in a file of any name": ("a.prn", "  X   Y   Z   R   G   B\n" + table("  ")),
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
@@ -155,6 +172,8 @@ TEXTS = {
     "grey: OFF without its word": ("a.off", "420 0 0\n" + table(" ", columns=POINTS)),
     "grey: OFF with a byte order mark": ("a.off", "\ufeffOFF\n420 0 0\n" + table(" ", columns=POINTS)),
     "grey: PLY with a byte order mark": ("a.ply", BOM_UTF8 + ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
+    "grey: a PLY of bare CR in text": ("a.ply", ply_bytes("ascii", "\r", rows=POINTS, properties=DOUBLES)),
+    "PLY in capitals, bytes with a point": ("a.ply", LOUD),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
@@ -451,7 +470,7 @@ REFUSED = [
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
-    ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
+    ("a.xyz", "# nothing yet\n", "holds 0 points: expected rows of numbers, .*; found 'nothing yet'"),
     ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS, .*git lfs pull"),
     ("a.ply", "<!DOCTYPE html>", "a web page, which is not read: download the file itself"),
     ("a.ply.gz", b"\x1f\x8b", "an archive, which is not read: unpack it first"),
@@ -478,7 +497,7 @@ REFUSED = [
     ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
     ("a.ply", ply_bytes(LITTLE, rows=DEEP, properties=XYZRGB[:3]), "0.5 apart at best .* extent of 0.9; move"),
     ("a.ply", ply_bytes(LITTLE)[:-20], "announces 3 points, the data ends after 2"),
-    ("b.obj", "# nothing\n", "no faces, and no vertices"),
+    ("b.stl", "solid a\nendsolid a\n", "no faces, and no vertices"),
     ("a.ply", b"solid of something", "not a PLY"),
     ("a.ply", PLY + b"element vertex 1\nproperty quad x\nend_header\n1\n", "property quad x"),
     ("a.ply", b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "known format"),
