@@ -364,7 +364,8 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
     if extent.max() > FARTHEST:
         raise UserError(f"holds points {extent.max():.2g} apart: a broken file, or one of another byte order")
     if steps.max() > MOST_LOST * extent.max() > 0:
-        found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
+        kind = short[int(steps.argmax())]
+        found = f"{steps.max():g} apart at best in {kind and kind.name}, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
     for axis, step, width, far, column in zip("xyz", steps, extent, farthest, positions.T, strict=True):
         fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text of numbers that were float32

@@ -75,6 +75,7 @@ BRIGHTEST = 0.99  # quantile of the intensities shown as white; its complement i
 LEAST_GREY = 0.5 / 255
 SHORTEST = 1e-30  # length of a normal below which it has no direction
 FOG, INVISIBLE = 0.2, 0.02  # opacity below which splats, and other points, are left out
+LARGEST_LOGIT = 50  # of splats; above it their opacities are bytes
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
@@ -192,19 +193,17 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
 def invisible(columns: Columns) -> np.ndarray:
     """Mask (points,) of nearly transparent points; none if the file has no opacity, or only zeros."""
-    nothing = np.zeros(len(columns["x"]))
-    values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
-    low, high = values.min(initial=0), values.max(initial=0)
-    if "splat_opacity" in columns or low < 0:
-        # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes
-        white = 255 if high > 1 and not (values % 1).any() else 1
-        return values < (FOG * white if low >= 0 and high <= white else np.log(FOG / (1 - FOG)))
     if "alpha" not in columns and "rgba" in columns:
         columns["alpha"] = _unpack(columns["rgba"])[:, 3]
-    values = columns.get("alpha", columns.get("opacity", nothing))
-    highest = float(values.max(initial=0))
+    name = next((name for name in ("splat_opacity", "alpha", "opacity") if name in columns), "")
+    values, of_splats = columns.get(name, np.zeros(len(columns["x"]))), name == "splat_opacity"
+    low, high = (float(end(initial=0)) for end in (values.min, values.max))
+    # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes
+    if name != "alpha" and (low < 0 or (of_splats and 1 < high <= LARGEST_LOGIT)):
+        return values < np.log(FOG / (1 - FOG))
     # packed colours have an alpha of 0 if none was written
-    return values < (INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2) if highest > 0 else -np.inf)
+    white = full_scale(values.dtype, max(1.0, high), high < 2) if high > 0 else -np.inf
+    return values < white * (FOG if of_splats else INVISIBLE)
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
@@ -306,7 +305,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear)
     low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
     if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
-        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")
+        others = "; sRGB colours are named red green blue" if linear else " or 0 to 255"
+        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1{others}")
     values = channels / white
     lines = [] if linear else [f"{name} taken as sRGB in 0..{white:g}"]
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):

@@ -101,10 +101,12 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         while rows := list(islice(lines, PIECE_LINES)):
             found += len(rows)
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
-            names = names or _names(before, table, path.suffix.lower(), report)
-            if {names[i] for i in unread} & {*"xyz", *COLOR}:
-                raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
-            names = tuple("rgb" if PACKED.fullmatch(word) else name for name, word in zip(names, words, strict=True))
+            if not names:
+                names = _names(before, table, path.suffix.lower(), report)
+                if {names[i] for i in unread} & {*"xyz", *COLOR}:
+                    raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+                of_words = {i: "rgb" if PACKED.fullmatch(words[i]) else f"{names[i]} (words)" for i in unread}
+                names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -127,7 +129,7 @@ def encoding_of(head: bytes) -> str:
 
 def _plain(line: str) -> str:
     """The line without brackets, quotes and separators of thousands; commas inside quotes are decimal ones."""
-    text = line.strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
+    text = line.strip().strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
     if text[:1] in ("[", "(", "{"):
         text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
     if '"' in text:
@@ -311,10 +313,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
             tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
             yield _archive_columns(tables, report)
             return
-    if not magic.startswith(b"\x93NUMPY"):
-        raise UserError("is not a NumPy file")
-    advice = "save arrays, as np.savez(file, points=..., colors=...)"
-    broken = f"is a broken, truncated or pickled NumPy file: {advice}"
+    broken = "is a broken, truncated or pickled NumPy file: save arrays, as np.savez(file, points=..., colors=...)"
     try:
         with _parsing(broken):
             rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))

@@ -99,11 +99,9 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
         if len(rows) % 3:
             raise UserError(f"is cut off: {len(rows)} corners, where each triangle has 3")
     else:
-        if len(data) < STL_HEAD:
-            raise UserError(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
         held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
-        if announced > held:
-            raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
+        if announced > held or held < 0:
+            raise UserError(f"is cut off: its header announces {announced} triangles, {max(held, 0)} are there")
         if held > announced:
             read = announced or held
             loading.say(f"the header announces {announced} triangles, {held} stand behind it, {read} are read")
@@ -139,8 +137,7 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
-        palette = all(len(values) == 1 for values in behind)
-        loading.ignored.add("colours of faces by a palette" if palette else "colours of some faces alone")
+        loading.ignored.add("colours of some faces alone, or by a palette")
     return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 

@@ -112,10 +112,7 @@ COLORED_MESHES = {
     "OBJ of bare CR": ("a.obj", ("".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE).replace("\n", "\r")),
     "OBJ with a byte order mark": ("a.obj", "\ufeff" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
     "OBJ named .ply": ("a.ply", "# made\n" + "".join(f"v {c} 40 170 60\n" for c in CORNERS) + OBJ_FACE),
-    "NCOFF of MeshLab": (
-        "a.off",
-        "NCOFF\n4 1 0\n" + "".join(f"{c} 40 170 60 255 0 0 1\n" for c in CORNERS) + "4 0 1 2 3\n",
-    ),
+    "MeshLab's OFF": ("a.off", "NCOFF\n4 1 0\n" + "".join(f"{c} 40 170 60 9 0 0 1\n" for c in CORNERS) + "4 0 1 2 3\n"),
     "OBJ of ZBrush": ("a.obj", "".join(f"v {c}\n" for c in CORNERS) + "#MRGB " + 4 * "ff28aa3c" + "\n" + OBJ_FACE),
     "OBJ": ("a.obj", "".join(f"v {c} 0.157 0.667 0.235\n" for c in CORNERS) + OBJ_FACE),
 }
@@ -287,10 +284,7 @@ SAID = {  # positions and perhaps normals, what a line about them says
     "one normal": (np.column_stack([BALL, np.tile([0.0, 0, -1], (420, 1))]), f"{LEFT_OUT}all are the same"),
     "normals across": (np.column_stack([BALL, ACROSS]), f"{LEFT_OUT}they lie across the surface"),
     "normals of any sign": (np.column_stack([BALL, spiral(420) * ANY]), f"{LEFT_OUT}those of neighbours have opposite"),
-    "normals of a thin wall": (
-        np.column_stack([PLATE * [1, 1, 0] + 1e-3 * WALL, WALL]),
-        None,
-    ),
+    "normals of a thin wall": (np.column_stack([PLATE * [1, 1, 0] + 1e-3 * WALL, WALL]), None),
     "normals outwards": (np.column_stack([BALL, spiral(420)]), None),
     "normals inwards": (np.column_stack([BALL, -spiral(420)]), None),
 }

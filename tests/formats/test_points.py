@@ -92,11 +92,10 @@ OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for
 PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+FLOATS = [(*row[:3], 40.0, 170.0, 60) for row in ROWS]
 THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROWS]
 GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
-LOUD = ply_bytes("ascii", rows=[(*row[:3], 40.0, 170.0, 60) for row in ROWS], properties=XYZRGB).replace(
-    b"float", b"Float"
-)
+LOUD, V_NAMES = ply_bytes("ascii", rows=FLOATS, properties=XYZRGB).replace(b"float", b"Float"), "V1 V2 V3 V4 V5 V6\n"
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
@@ -122,16 +121,14 @@ TEXTS = {
     "tabs that align": ("a.txt", "x\t\ty\tz\t\tr\tg\tb\n" + table("\t")),
     "tabs and blanks": ("a.txt", "x y z\tr g b\n" + table(" ")),
     "names in German, as Excel writes them": ("a.csv", GERMAN.encode("cp1252")),
-    "names by number, of R and Matlab": ("a.txt", "V1 V2 V3 V4 V5 V6\n" + table(" ")),
+    "names by number, of R, and numbers of Fortran": ("a.txt", V_NAMES + table(" ").replace(" ", "D+00 ")),
     "brackets around each row": ("a.txt", "[[" + table(", ").replace("\n", "],\n[")),
     "thousands, Swiss": ("a.txt", table(" ", columns=THOUSANDS).replace(",", "'")),
     "thousands, German": ("a.txt", table(";", columns=THOUSANDS).translate({44: ".", 46: ","})),
     "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
     "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
     "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
-    "numbers of Fortran": ("a.txt", table(" ").replace(" ", "D+00 ")),
-    "minus signs": ("a.txt", table(" ").replace("-", "\N{MINUS SIGN}")),
-    "names in a file of any name": ("a.prn", "  X   Y   Z   R   G   B\n" + table("  ")),
+    "names in any file, minus signs": ("a.prn", "  X Y Z R G B\n" + table("  ").replace("-", "\N{MINUS SIGN}")),
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
@@ -156,7 +153,7 @@ TEXTS = {
     "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
     **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
     "grey: decimal commas in quotes": ("a.csv", QUOTED),
-    "a column of words": ("a.csv", "x,y,z,r,g,b,label\n" + table(",", ",chair")),
+    "a column of words": ("a.csv", "x,y,z,r,g,b,metallic\n" + table(",", ",true")),
     "words before the numbers": ("a.csv", WORDY),
     "fields that are not known": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "NA,1,1,1,2,3\nNULL,n/a,1,1,2,3\n"),
     "bars": ("a.txt", "x|y|z|r|g|b\n" + table("|")),
@@ -515,7 +512,7 @@ REFUSED = [
     ("a.pcd", PCD.replace(b"POINTS 12", b"POINTS -4"), "-4"),
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
     ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
-    ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
+    ("a.npy", pickle.dumps([1, 2]), "broken, truncated or pickled"),
     ("a.npy", as_npy(np.zeros(3, [("x", "<f4", (0,))])), "records without bytes"),
     ("a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 9001) + b"~" * 9000 + b"1", "a broken, truncated or pickled"),
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
