@@ -235,7 +235,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
             "(then intensity, r g b, nx ny nz, roughness metallic), or a header line that names the columns"
         )
     steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
-    timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
+    timed = steps.min() > 0 and steps.std() < steps.mean() / 2
     whole = (table % 1 == 0).all(axis=0)
     pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # pixels: row and column first
     first = 2 if pictured else int(timed or np.all(steps == 1))
@@ -255,7 +255,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         alike = {i: _likeness(table, i) if len(table) > 2 else 0.0 for i in colored}
         start = max(colored, key=alike.__getitem__)
         names[start : start + 3] = COLOR
-        close = [i for i in colored if i != start and 0 < alike[start] - CLOSE < alike[i]]
+        close = [i for i in colored if i != start and alike[start] - CLOSE < alike[i]]
         rest, left = table[:, start + 3 :], count - start - 3
         share = rest.min(initial=0) >= 0 and rest.max(initial=0) <= 1 and not np.all(rest % 1 == 0)
         if left == 1 and (np.isin(rest, OPAQUE).all() or (share and table[:, 3:].max() <= 1 and np.median(rest) == 1)):

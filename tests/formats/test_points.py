@@ -214,18 +214,17 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
     np.testing.assert_allclose(cloud.base_color, SRGB[colors], atol=1e-4)
 
 
-def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
-    four = 0.9 * np.random.default_rng(0).integers(0, 256, (420, 1)) + np.random.default_rng(1).uniform(0, 25, (420, 4))
-    _, lines = read(write(tmp_path, "a.txt", table(" ", columns=np.column_stack([BALL, np.round(four)]))))
-    assert "r g b may as well be columns 5 to 7: name them in a first line" in lines[0]
-
-
 @pytest.mark.parametrize(
     ("name", "data", "line"),
     [
         ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
         ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
-        ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
+        (
+            "a.txt",
+            table(" ", columns=LABELED),
+            "the 7 columns, which have no names, taken as x y z r g b scalar; "
+            "r g b may as well be columns 5 to 7: name them in a first line",
+        ),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         (
             "a.csv",
