@@ -65,7 +65,6 @@ NAMES = {name for group in ALIASES.values() for names in group for name in names
 ARRAYS = {name.removesuffix("0") for name in NAMES}
 OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # prefixes
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
-PROPERTIES = ("roughness", "metallic")
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
@@ -212,7 +211,7 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
     If the file has neither roughness nor metallic, also `materials_known` (points,), all 0.
     """
     count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
-    found |= {name: _unit_interval(columns[name], name, report) for name in PROPERTIES if name in columns}
+    found |= {name: _unit_interval(columns[name], name, report) for name in [*DEFAULTS][1:] if name in columns}
     complete = {} if len(found) > 1 else {"materials_known": np.zeros(count)}
     for name, default in DEFAULTS.items():
         if (values := found.get(name)) is None:
@@ -235,13 +234,12 @@ def normals(columns: Columns) -> np.ndarray | None:
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     """Linear base colours (points, 3), from colours or intensities; None if there are none."""
     intensity = np.asarray(columns.get("intensity", [np.nan]), np.float64)
+    colors, lines = colors_of(columns) or (None, [])
     # LAS records have colour fields even if the scanner saw none
-    sharp = "intensity" in columns and set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
-    unseen = sharp and not any(columns[name].any() for name in SRGB)
-    if not unseen and (found := colors_of(columns)) is not None:
-        for line in found[1]:
+    if colors is not None and (colors.any() or "intensity" not in columns):
+        for line in lines:
             report(line)
-        return found[0]
+        return colors
     known = np.isfinite(intensity)
     if not known.any():
         return None

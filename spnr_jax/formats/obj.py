@@ -20,8 +20,9 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
-from spnr_jax.formats.columns import SRGB, Columns, colors_of, full_scale
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
 from spnr_jax.formats.point_tables import load_text, open_text
+from spnr_jax.formats.polygons import colored_part
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
 
@@ -47,13 +48,12 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
     columns = _columns(text, loading)
+    if not text["f sizes"]:
+        if len(text["vn"]) == len(text["v"]):
+            columns |= dict(zip(NORMAL, _table(text["vn"], 3, "vn").T, strict=True))
+        return colored_part(columns, np.zeros(0, np.int64), np.zeros(0, np.int64), {}, loading)
     colors, notes = colors_of(columns) or (None, [])
     loading.say(*notes)
-    if not text["f sizes"]:
-        normals = _table(text["vn"], 3, "vn") if len(text["vn"]) == len(text["v"]) else None
-        material = make_material(0.5 if colors is None else 1.0)
-        none = np.zeros((0, 3), np.int64)
-        return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
     for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+(?!#)", names.strip())):
         library |= parse_mtl(loading.read(name.partition(" #")[0]) or b"")

@@ -1,9 +1,8 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
-Separators are commas, semicolons, bars or blanks, also at the end of a line; brackets around a row, and separators of
-thousands, are dropped.  A comma is a decimal one inside quotes, or if something else separates the numbers.  Lines of a
-single integer are counts of points.  A header line, also one after #, % or //, names the columns; columns without a
-name, and columns of words other than #rrggbb, are not read.
+Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
+or if something else separates the numbers; 1.234,5 has a thousand.  Lines of a single integer are counts of points.  A
+header line, also one after #, % or //, names the columns; columns without a name, or of words, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 
     .npz    named arrays (points, c) or (points,); an array of positions may have more columns, as in text
@@ -43,7 +42,6 @@ Line = tuple[int, str]  # line number in the file, from 1, and text
 
 COLOR = ("r", "g", "b")
 OPAQUE = (1, 255, 65535)  # usual constant values of alpha
-NUMBERS = "fiu"  # dtype kinds of real numbers
 UNIT_LENGTH = 0.02  # tolerance of the length of a normal
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of sRGB (BT.601)
 CLOSE = 0.15  # difference of correlations below which the choice of colour columns is reported as ambiguous
@@ -103,8 +101,6 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             if not names:
                 names = _names(before, table, path.suffix.lower(), report)
-                if {names[i] for i in unread} & {*"xyz", *COLOR}:
-                    raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
                 of_words = {i: "rgb" if PACKED.fullmatch(words[i]) else f"{names[i]} (words)" for i in unread}
                 names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
@@ -228,7 +224,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
 
     Normals are the first three columns that can be; colours the three most correlated ones that can be.
     """
-    count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
+    count = table.shape[1] if table.ndim == 2 and table.dtype.kind in "fiu" else 0
     if count < 3 or count > MOST_COLUMNS:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of x y z "
@@ -255,13 +251,15 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         alike = {i: _likeness(table, i) if len(table) > 2 else 0.0 for i in colored}
         start = max(colored, key=alike.__getitem__)
         names[start : start + 3] = COLOR
-        close = [i for i in colored if i != start and alike[start] - CLOSE < alike[i]]
         rest, left = table[:, start + 3 :], count - start - 3
         share = rest.min(initial=0) >= 0 and rest.max(initial=0) <= 1 and not np.all(rest % 1 == 0)
         if left == 1 and (np.isin(rest, OPAQUE).all() or (share and table[:, 3:].max() <= 1 and np.median(rest) == 1)):
             names[-1] = "alpha"
         if left == 2 and share:
             names[-2:] = "roughness", "metallic"
+        close = [
+            i for i in colored if i != start and alike[i] > alike[start] - CLOSE and "alpha" not in names[i : i + 3]
+        ]
     if names[3:4] == ["scalar"]:
         packed = count == 4 and whole[3] and OPAQUE[-1] < np.median(table[:, 3]) <= table[:, 3].max() < 2**24
         names[3] = "rgb" if packed else "intensity"
@@ -321,8 +319,6 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    if not rows.dtype.itemsize:
-        raise UserError("holds records without bytes; expected points")
     fields = rows.dtype.names
     rows = rows.reshape(-1) if fields else _as_rows(rows, report)
     names = fields or plain_names(rows[:PIECE_LINES], report)

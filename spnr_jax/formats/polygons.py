@@ -48,7 +48,7 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     told = header.textures or any("texture" in name for name, *_ in header.elements)
     if texcoords is not None or "texcoord" in lists or told:
         loading.ignored.add("texture coordinates")
-    return _colored(vertices, corners, sizes, of_faces, loading)
+    return colored_part(vertices, corners, sizes, of_faces, loading)
 
 
 def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray | None:
@@ -109,7 +109,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
         corners = table["corners"]
         loading.ignored |= {"colours in STL"} if table["attribute"].any() or b"COLOR=" in data[:80] else set()
     columns = dict(zip("xyz", corners.reshape(-1, 3).T, strict=True))
-    return _colored(columns, np.arange(corners.size // 3), np.full(corners.size // 9, 3), {}, loading)
+    return colored_part(columns, np.arange(corners.size // 3), np.full(corners.size // 9, 3), {}, loading)
 
 
 def load_off(path: Path, loading: Loading) -> list[Part]:
@@ -138,13 +138,13 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
         loading.ignored.add("colours of some faces alone, or by a palette")
-    return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
+    return colored_part(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
 
 
-def _colored(
+def colored_part(
     vertices: Columns, corners: np.ndarray, sizes: np.ndarray, of_faces: Columns, loading: Loading
 ) -> list[Part]:
     """The part of polygons with `sizes` corners each, coloured by its vertices, else by its polygons."""

@@ -186,13 +186,12 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
             if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
                 raise UserError(f"has lists of several lengths: {list_names([*fields])}")
             yield columns | name_columns({name: x.reshape(len(sizes), -1) for name, (sizes, x) in fields.items()})
-        name, count, properties = header.elements[-1]
-        held, begin = 0, file.tell()
-        if name == "vertex" and header.encoding == "ascii":
-            held = sum(1 for _ in _lines(file))
-        elif name == "vertex" and not any(isinstance(width, str) for *_, width in properties):
-            held = (file.seek(0, SEEK_END) - begin) // max(1, _layout(properties, {})[0].itemsize)
-        if held:
+        (name, count, properties), begin = header.elements[-1], file.tell()
+        if name != "vertex" or any(isinstance(width, str) for *_, width in properties):
+            return
+        size = max(1, _layout(properties, {})[0].itemsize)
+        binary = header.encoding == "binary"
+        if held := (file.seek(0, SEEK_END) - begin) // size if binary else sum(1 for _ in _lines(file)):
             report(f"the header announces {count:,} points, {held:,} more stand behind them and are not read")
 
 
