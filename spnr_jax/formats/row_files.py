@@ -40,7 +40,6 @@ BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 LONGEST_LIST = 2**20  # items
 PLY_LIMIT, PCD_LIMIT = 2**20, 2**16  # bytes of a header
 POINT_LIMIT = 2**16  # bytes of a point: histograms have hundreds of numbers; NumPy crashes on records of 2 GiB
-ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 KINDS = {"F": "<f", "I": "<i", "U": "<u"}
 LONGEST_LITERAL = 32  # LZF: a control byte c < 32 precedes c + 1 literal bytes; others copy earlier bytes
@@ -271,9 +270,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
     entries: dict[str, list[str]] = {}
     for line in data[: end.end()].decode("utf-8-sig", "replace").splitlines():
         word, *values = line.split() or ["#"]
-        if word not in ENTRIES and not word.startswith("#"):
-            raise UserError(f"has a PCD header line that is not understood: {line.strip()!r}")
-        entries[word] = values
+        entries[word.upper().replace("COLUMNS", "FIELDS")] = values
     if (encoding := end[1].decode("ascii", "replace").lower()) not in ENCODINGS:
         raise UserError(f"has PCD data of kind {encoding!r}; expected one of {', '.join(ENCODINGS)}")
     try:
