@@ -341,10 +341,7 @@ def _without_no_data(columns: Columns, report: Report) -> Columns:
 
 
 def _check_rounding(positions: np.ndarray, report: Report, of_mesh: bool = False) -> None:
-    """Reports axes with few distinct values for so many points, far apart, or one value far from the origin.
-
-    Of meshes, whose walls and floors have few values anyway, only those far from the origin.
-    """
+    """Reports axes with few distinct values, far apart; of meshes, whose walls have few, only far from the origin."""
     extent = float(np.ptp(positions, axis=0).max())
     for axis, column in zip("xyz", positions.T, strict=True):
         far, count = np.abs(column).max() > SIX_DIGITS * extent, len(np.unique(column))

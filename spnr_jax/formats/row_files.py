@@ -231,7 +231,7 @@ def _ply_header(file: BufferedIOBase) -> Header:
     newline = re.search(rb"\r\n|\n|\r", data)
     # after a header with \r line ends, the first byte of data may be a \n
     end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + newline[0], data) if newline else None
-    if not data.removeprefix(BOM_UTF8).startswith(b"ply") or end is None:
+    if newline is None or end is None or not data.removeprefix(BOM_UTF8).startswith(b"ply"):
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     order: str | None = None
     textures: list[str] = []

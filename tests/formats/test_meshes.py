@@ -76,13 +76,6 @@ def test_a_ply_has_its_textures_by_face_or_by_vertex(tmp_path, form):
     np.testing.assert_allclose(part.material.base_color, expected, atol=1e-6)
 
 
-def test_an_stl_that_may_be_cut_off_says_so(tmp_path):
-    corners = "".join("vertex {} {} 0\n".format(*pair) for pair in ((0, 0), (1, 0), (0, 1)))
-    for end, said in (("endsolid a\n", False), ("", True)):
-        (tmp_path / "a.stl").write_text(f"solid a\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n{end}")
-        assert (load_mesh(tmp_path / "a.stl").notes != ()) == said
-
-
 # Real files
 
 REAL = pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real mesh files is not beside this checkout")

@@ -103,7 +103,7 @@ PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for ro
 PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
 WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
-PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
+PCL = "VERSION .7\nCOLUMNS x y z rgb\nsize 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
 FLOATS = [(*row[:3], 40.0, 170.0, 60) for row in ROWS]
