@@ -265,7 +265,6 @@ FLAT, SHORT = BALL * [50, 0.05, 50] + [0, 3e3, 0], r"only \d+ distinct values al
 PLATE, LEFT_OUT = np.random.default_rng(0).uniform(-1, 1, (420, 3)), "normals of the file left out: "
 ACROSS = spiral(420)[:, [1, 2, 0]] * [1, -1, 1]
 ANY = np.random.default_rng(1).choice([-1.0, 1.0], (420, 1))
-WALL = ANY * [0, 0, 1]
 SAID = {  # positions and perhaps normals, what a line about them says
     "degrees": (BALL * [5e-5, 5e-5, 8] + [8.5, 47.1, 400], "x and y look like degrees"),
     "a handful": (BALL[:5], "5 points alone tell next to no surface"),
@@ -283,7 +282,7 @@ SAID = {  # positions and perhaps normals, what a line about them says
     "one normal": (np.column_stack([BALL, np.tile([0.0, 0, -1], (420, 1))]), f"{LEFT_OUT}all are the same"),
     "normals across": (np.column_stack([BALL, ACROSS]), f"{LEFT_OUT}they lie across the surface"),
     "normals of any sign": (np.column_stack([BALL, spiral(420) * ANY]), f"{LEFT_OUT}those of neighbours have opposite"),
-    "normals of a thin wall": (np.column_stack([PLATE * [1, 1, 0] + 1e-3 * WALL, WALL]), None),
+    "normals of a thin shell": (np.column_stack([BALL * (1 + 1e-3 * ANY), spiral(420) * ANY]), None),
     "normals outwards": (np.column_stack([BALL, spiral(420)]), None),
     "normals inwards": (np.column_stack([BALL, -spiral(420)]), None),
 }
