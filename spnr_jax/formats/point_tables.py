@@ -52,7 +52,7 @@ MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names;
 COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)([ed][+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
 # separators of thousands, if a semicolon separates the numbers, and if not; the last mark in 1.234,5 is the decimal one
-THOUSANDS = (re.compile(r"(?<=\d)(['’\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’](?=\d{3})"))
+THOUSANDS = (re.compile(r"(?<=\d)(['’\ufffd\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"))
 PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
