@@ -91,7 +91,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     data = path.read_bytes()
     announced = int.from_bytes(data[80:STL_HEAD], "little")
     whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # then it is binary, whatever its first bytes
-    if not whole and re.match(rb"(\xef\xbb\xbf)?\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
+    if not whole and re.match(rb"(\xef\xbb\xbf)?\s*(solid|facet)\b[^\0]*?(facet|endsolid|vertex)", data, re.IGNORECASE):
         rows = [row.decode("ascii", "replace") for row in re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)]
         corners = load_text([*enumerate(rows, 1)], "vertex", 3, ndmin=2) if rows else np.zeros((0, 3))
         if not re.search(rb"(?i)\bendsolid\b", data):
