@@ -53,6 +53,7 @@ COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)([ed][+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
 # separators of thousands, if a semicolon separates the numbers, and if not; the last mark in 1.234,5 is the decimal one
 THOUSANDS = (re.compile(r"(?<=\d)(['’\ufffd\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"))
+PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
 PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
@@ -125,7 +126,9 @@ def encoding_of(head: bytes) -> str:
 
 def _plain(line: str) -> str:
     """The line without brackets, quotes and separators of thousands; commas inside quotes are decimal ones."""
-    text = line.strip().strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
+    if PLAIN.fullmatch(text := line.strip()):
+        return text
+    text = text.strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
     if text[:1] in ("[", "(", "{"):
         text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
     if '"' in text:

@@ -186,6 +186,7 @@ def test_points_without_colour_among_others_take_that_of_their_neighbours_and_bl
     cloud, lines = read(colored_ball(tmp_path, colors))
     assert (cloud.base_color[BALL[:, 0] > 0] == 0).all()
     assert not any("no colour (0 0 0)" in line for line in lines)
+    assert any("nearly black" in line for line in read(colored_ball(tmp_path, 3, "u1"))[1])
 
 
 # What other columns say
@@ -219,10 +220,6 @@ def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_p
     assert any(re.match(words, line) for line in lines)
     kept = read_cloud(path, cut=Cut(keep_noise=True)).positions
     assert len(kept) == (280 if words == BROKEN else 420)
-
-
-def test_a_line_says_that_the_picture_will_be_black(tmp_path):
-    assert any("nearly black" in line for line in read(colored_ball(tmp_path, 3, "u1"))[1])
 
 
 # Precision, repeats

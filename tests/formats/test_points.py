@@ -186,7 +186,6 @@ TEXTS = {
     "grey: a PLY of bare CR in text": ("a.ply", ply_bytes("ascii", "\r", rows=POINTS, properties=DOUBLES)),
     "PLY in capitals, bytes with a point": ("a.ply", LOUD),
     "grey: NumPy of Python 2": ("a.npy", as_npy(BALL).replace(b"(420, 3), }  ", b"(420L, 3L), }")),
-    "grey: the same in an archive": ("a.npz", archive(as_npy(BALL).replace(b"(420, 3), }  ", b"(420L, 3L), }"))),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
