@@ -6,6 +6,7 @@ import importlib
 import io
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -58,7 +59,10 @@ def is_bug(error: Exception) -> bool:
 
 def first_line(error: Exception) -> str:
     """First line of an error message (libraries may append call stacks); the type if there is no message."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    if found := re.match(r"(?:invalid literal|could not convert string).*?('[^']*')", line):  # Python's, NumPy's
+        return f"expected a number, found {found[1]}"
+    return line
 
 
 def check_kind(value: Any, kind: type | UnionType, expected: str) -> None:

@@ -162,10 +162,10 @@ class Loading:
     def decode_image(self, data: bytes, name: str) -> np.ndarray | None:
         """Texels (h, w, 4) of the bytes of an image; None if they cannot be read."""
         try:
-            return read_image(data, name)
+            with refusing(name):
+                return decode_image(data)
         except UserError as error:
-            reason, _, found = str(error).partition(": ")
-            self.go_on_without(reason, found)
+            self.go_on_without("names an image that cannot be read", str(error))
         return None
 
     def say(self, *sentences: str, about: str = "") -> None:
@@ -229,12 +229,6 @@ def _find(folder: Path, names: list[str]) -> Path | None:
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
-
-
-def read_image(data: bytes, name: str) -> np.ndarray:
-    """Texels as of `decode_image`; ValueError, which names the image, if it cannot be read."""
-    with refusing(f"names an image that cannot be read: {name}"):
-        return decode_image(data)
 
 
 def decode_image(data: bytes) -> np.ndarray:

@@ -48,10 +48,9 @@ def read_document(path: str | Path, report: Callable[[str], None] = lambda line:
         cameras_of(document)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from None
-    except UserError as error:
-        raise UserError(f"{path}: {error}; {EXPECTED}") from None
-    except KeyError as error:
-        raise UserError(f"{path}: no entry {error}; {EXPECTED}") from None
+    except (UserError, KeyError) as error:
+        missing = "no entry " if isinstance(error, KeyError) else ""
+        raise UserError(f"{path}: {missing}{error}; {EXPECTED}") from None
     except (TypeError, ValueError, OverflowError, RecursionError):
         raise UserError(f"{path}: no valid JSON, or something else where a number should be; {EXPECTED}") from None
     if any(frame.get(name) for frame in (document, *document["frames"]) for name in DISTORTION):

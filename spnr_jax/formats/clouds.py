@@ -59,10 +59,11 @@ LOST_STEP = 1e-3  # of the extent of an axis: above it, the rounding of the file
 MOST_LOST = 5e-3  # of the extent: above it rounding has destroyed the shape
 ROUNDED = 0.02  # of the extent: distance between values of an axis above which it may have been rounded
 SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis: six digits leave at most a hundred values there
-NO_DATA = (-9999, -32767, -32768)  # heights that mean "unknown" in grids
+NO_DATA = (-9999, -32767, -32768, -99999)  # heights that mean "unknown" in grids
 SAMPLE = 512  # points at which the file's normals are checked against the points
 FEWEST = 10  # points from which a surface can be estimated
 LEAST_POINTS = 100  # from which normals and missing colours can be checked
+OPPOSED = 0.15  # share of normals opposite to that of the nearest point, above which their signs mean nothing
 AGREEING = 0.6  # median cosine between given and estimated normals, below which the given ones are ignored
 PARALLEL = 0.9  # cosine to a constant normal, and the share of the points that must have it
 DEGREES, NEEDLE = 0.5, 100.0  # largest width in degrees; ratio of height to width above which degrees are suspected
@@ -251,8 +252,7 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
     """Points sampled on the surface of a mesh minus an origin (3,), which is 0 unless float32 is too coarse."""
     corners, report = np.stack(bounding_box(asset)), how.report
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
-    # walls and floors have few distinct values anyway, so this is checked only far from the origin
-    _check_rounding(vertices, np.abs(corners).max(axis=0) > SIX_DIGITS * np.ptp(corners, axis=0), report)
+    _check_rounding(vertices, report, of_mesh=True)
     if kind not in TEXT_MESHES:
         # vertices are float64 here, whatever the file's type was
         short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
@@ -308,7 +308,7 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
     positions = stack_columns(columns)
     if not sampled:
         _check_steps(positions, [columns[axis] for axis in "xyz"], report)
-        _check_rounding(positions, np.ones(3, bool), report)
+        _check_rounding(positions, report)
     origin = _find_origin(positions)
     values, directions = materials(columns, report), normals(columns)
     if directions is not None:
@@ -340,14 +340,15 @@ def _without_no_data(columns: Columns, report: Report) -> Columns:
     return {name: column[kept] for name, column in columns.items()} if not kept.all() else columns
 
 
-def _check_rounding(positions: np.ndarray, axes: np.ndarray, report: Report) -> None:
-    """Reports each of the chosen axes (mask (3,)) with far fewer distinct values than another axis, far apart."""
-    if not axes.any():
-        return
-    counts, extent = np.array([len(np.unique(column)) for column in positions.T]), np.ptp(positions, axis=0)
-    for axis, count, width, looked_at in zip("xyz", counts, extent, axes, strict=True):
-        if looked_at and 1 < count < counts.max() / 10 and width / (count - 1) > ROUNDED * extent.max():
-            report(f"only {count} distinct values along {axis}, {counts.max()} along another axis: is it rounded?")
+def _check_rounding(positions: np.ndarray, report: Report, of_mesh: bool = False) -> None:
+    """Reports axes with few distinct values, far apart; of meshes, whose walls have few, only far from the origin."""
+    extent = float(np.ptp(positions, axis=0).max())
+    for axis, column in zip("xyz", positions.T, strict=True):
+        far, count = np.abs(column).max() > SIX_DIGITS * extent, len(np.unique(column))
+        apart = far if count == 1 else np.ptp(column) > ROUNDED * (count - 1) * extent and (far or not of_mesh)
+        if apart and count < len(column) / 10:
+            values = "value" if count == 1 else "values"
+            report(f"only {count} distinct {values} along {axis} of {len(column):,} points: is it rounded?")
 
 
 def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
@@ -360,7 +361,8 @@ def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: R
     if extent.max() > FARTHEST:
         raise UserError(f"holds points {extent.max():.2g} apart: a broken file, or one of another byte order")
     if steps.max() > MOST_LOST * extent.max() > 0:
-        found = f"{steps.max():g} apart at best in float32, for an extent of {extent.max():g}"
+        kind = short[int(steps.argmax())]
+        found = f"{steps.max():g} apart at best in {kind and kind.name}, for an extent of {extent.max():g}"
         raise UserError(f"holds points {found}; move them to the origin")
     for axis, step, width, far, column in zip("xyz", steps, extent, farthest, positions.T, strict=True):
         fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text of numbers that were float32
@@ -405,4 +407,10 @@ def _doubt(positions: np.ndarray, tree: cKDTree, normals: np.ndarray) -> str:
         fits = float(np.mean(np.abs(surface @ normals[rows[0]]) > PARALLEL))
         return "all are the same, and the points lie in no plane" if fits < PARALLEL else ""
     cosine = float(np.median(np.abs(np.sum(surface * normals[rows], axis=1))))
-    return f"they lie across the surface of the points (cosine {cosine:.2f})" if cosine < AGREEING else ""
+    if cosine < AGREEING:
+        return f"they lie across the surface of the points (cosine {cosine:.2f})"
+    beside = tree.query(positions[rows], [2])[1][:, 0]
+    opposed = np.sum(normals[rows] * normals[beside], axis=1) < 0
+    # the two sides of a thin wall face away from each other
+    outwards = np.sum((positions[rows] - positions[beside]) * (normals[rows] - normals[beside]), axis=1) > 0
+    return "those of neighbours have opposite signs" if np.mean(opposed & ~outwards) > OPPOSED else ""

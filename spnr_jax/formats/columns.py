@@ -30,14 +30,17 @@ Report = Callable[[str], None]
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-# ignored in names: CloudCompare's prefix, separators, British spelling, and words such as `vertex`
-SILENT = re.compile(r"^scalar_|[\s.:_-]+|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)")
+# ignored in names: CloudCompare's prefix, separators, umlauts, British spelling, and words such as `vertex`
+SILENT = re.compile(
+    r"^scalar_|[\s.:_-]+|[^\x00-\x7f]|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
+)
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
 PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
 PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
-HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "höhe", "hoehe", "cota")
+HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "hhe", "hoehe", "cota")  # hhe: Höhe
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
+COLORS = "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb|rot grn blau|rot gruen blau|rouge vert bleu|rojo verde azul"
 ALIASES = {  # our names -> groups of names in files, without separators; the first complete group is taken
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
@@ -45,7 +48,7 @@ ALIASES = {  # our names -> groups of names in files, without separators; the fi
     for ours, stems, others in (
         (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
         (LINEAR, "basecolor albedo cd", "linearr linearg linearb|linearred lineargreen linearblue"),  # Houdini: Cd
-        (SRGB, "color colors rgb rgbs diffuse vertex", "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb"),
+        (SRGB, "color colors rgb rgbs diffuse vertex", COLORS),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
@@ -71,6 +74,7 @@ BRIGHTEST = 0.99  # quantile of the intensities shown as white; its complement i
 LEAST_GREY = 0.5 / 255
 SHORTEST = 1e-30  # length of a normal below which it has no direction
 FOG, INVISIBLE = 0.2, 0.02  # opacity below which splats, and other points, are left out
+LARGEST_LOGIT = 50  # of splats; above it their opacities are bytes
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
@@ -188,18 +192,17 @@ def keep_visible(columns: Columns, keep_noise: bool, report: Report) -> Columns:
 
 def invisible(columns: Columns) -> np.ndarray:
     """Mask (points,) of nearly transparent points; none if the file has no opacity, or only zeros."""
-    nothing = np.zeros(len(columns["x"]))
-    values = np.asarray(columns.get("splat_opacity", columns.get("opacity", nothing)), np.float64)
-    low, high = values.min(initial=0), values.max(initial=0)
-    if "splat_opacity" in columns or low < 0:
-        # logits, as Kerbl et al. write them, unless all are 0 to 1
-        return values < (FOG if low >= 0 and high <= 1 else np.log(FOG / (1 - FOG)))
     if "alpha" not in columns and "rgba" in columns:
         columns["alpha"] = _unpack(columns["rgba"])[:, 3]
-    values = columns.get("alpha", columns.get("opacity", nothing))
-    highest = float(values.max(initial=0))
+    name = next((name for name in ("splat_opacity", "alpha", "opacity") if name in columns), "")
+    values, of_splats = columns.get(name, np.zeros(len(columns["x"]))), name == "splat_opacity"
+    low, high = (float(end(initial=0)) for end in (values.min, values.max))
+    # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes
+    if name != "alpha" and (low < 0 or (of_splats and 1 < high <= LARGEST_LOGIT)):
+        return values < np.log(FOG / (1 - FOG))
     # packed colours have an alpha of 0 if none was written
-    return values < (INVISIBLE * full_scale(values.dtype, max(1.0, highest), highest < 2) if highest > 0 else -np.inf)
+    white = full_scale(values.dtype, max(1.0, high), high < 2) if high > 0 else -np.inf
+    return values < white * (FOG if of_splats else INVISIBLE)
 
 
 def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
@@ -208,7 +211,7 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
     If the file has neither roughness nor metallic, also `materials_known` (points,), all 0.
     """
     count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
-    found |= {name: _unit_interval(columns[name], name) for name in ("roughness", "metallic") if name in columns}
+    found |= {name: _unit_interval(columns[name], name, report) for name in [*DEFAULTS][1:] if name in columns}
     complete = {} if len(found) > 1 else {"materials_known": np.zeros(count)}
     for name, default in DEFAULTS.items():
         if (values := found.get(name)) is None:
@@ -231,13 +234,12 @@ def normals(columns: Columns) -> np.ndarray | None:
 def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     """Linear base colours (points, 3), from colours or intensities; None if there are none."""
     intensity = np.asarray(columns.get("intensity", [np.nan]), np.float64)
+    colors, lines = colors_of(columns) or (None, [])
     # LAS records have colour fields even if the scanner saw none
-    sharp = "intensity" in columns and set(SRGB) <= columns.keys() and not set(LINEAR) <= columns.keys()
-    unseen = sharp and not any(columns[name].any() for name in SRGB)
-    if not unseen and (found := colors_of(columns)) is not None:
-        for line in found[1]:
+    if colors is not None and (colors.any() or "intensity" not in columns):
+        for line in lines:
             report(line)
-        return found[0]
+        return colors
     known = np.isfinite(intensity)
     if not known.any():
         return None
@@ -251,9 +253,13 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
     return srgb_to_linear(np.repeat(grey[:, None], 3, axis=-1))
 
 
-def _unit_interval(values: np.ndarray, name: str) -> np.ndarray:
-    """Roughness or metallic in [0, 1], without rounding errors; ValueError if they lie outside."""
-    scaled = values / full_scale(values.dtype, float(values.max(initial=0)), linear=True)
+def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
+    """Roughness or metallic in [0, 1] or of whole bytes, without rounding errors; ValueError if they lie outside."""
+    highest = float(values.max(initial=0))
+    scale = full_scale(values.dtype, highest, linear=highest <= 100 or bool((values % 1).any()))
+    if scale > 1:
+        report(f"{name} taken to be in 0..{scale:g}")
+    scaled = values / scale
     if not (scaled.min() >= -ROUNDING and scaled.max() <= 1 + ROUNDING):
         raise UserError(f"has {name} from {scaled.min():g} to {scaled.max():g}; expected 0 to 1")
     return np.clip(scaled, 0, 1)
@@ -297,7 +303,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
     white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear)
     low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
     if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
-        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1 (colours: or 0 to 255)")
+        others = "; sRGB colours are named red green blue" if linear else " or 0 to 255"
+        raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1{others}")
     values = channels / white
     lines = [] if linear else [f"{name} taken as sRGB in 0..{white:g}"]
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):

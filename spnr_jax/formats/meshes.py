@@ -8,7 +8,6 @@ tint      for references, where mitsuba takes a texture or vertex colours but no
 """
 
 import hashlib
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,14 +49,13 @@ def load_mesh(
     loading = Loading(path.parent, root if kind == ".obj" else None, transparent_parts)
     with (
         refusing("cannot be read, the file is broken or truncated"),
-        warnings.catch_warnings(),
         np.errstate(all="ignore"),  # `assemble` checks for what is not finite
     ):
-        # NumPy only warns about text that is no number
-        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
         if kind not in READERS:
             raise UserError(f"has suffix {kind!r}; expected one of {' '.join(SUFFIXES)}")
         parts = READERS[kind](path, loading)
+        if parts and not any(len(part.positions) for part in parts):
+            raise UserError("has no faces, and no vertices")
         for part in parts:
             _check_columns(part)
         if loading.strict or not parts or any(len(part.faces) for part in parts):

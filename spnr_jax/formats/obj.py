@@ -20,8 +20,9 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
-from spnr_jax.formats.columns import SRGB, Columns, colors_of, full_scale
-from spnr_jax.formats.point_tables import UNDEFINED, open_text
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
+from spnr_jax.formats.point_tables import load_text, open_text
+from spnr_jax.formats.polygons import colored_part
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
 
@@ -29,6 +30,7 @@ Rests = dict[str, list]
 Move = tuple[tuple[float, float], tuple[float, float]]  # scale and offset of texture coordinates
 Look = tuple[Material | None, Move]  # None for a material that is invisible everywhere
 UNMOVED: Move = (1.0, 1.0), (0.0, 0.0)
+POLYPAINT = "#MRGB"  # of ZBrush: mask, red, green and blue of each vertex, in hexadecimal digits
 MAPS = ("map_kd", "map_pr", "map_pm", "map_d")
 NEARLY_GREY = 16  # of 255: largest difference between the channels of a grey JPEG
 READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
@@ -43,18 +45,15 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     """The file's faces grouped by material."""
     with open_text(path) as file:
         text = _parse(file.read())
-    if not (text["f sizes"] or text["v"]):
-        raise UserError("has no faces, and no vertices")
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
     columns = _columns(text, loading)
+    if not text["f sizes"]:
+        if len(text["vn"]) == len(text["v"]):
+            columns |= dict(zip(NORMAL, _table(text["vn"], 3, "vn").T, strict=True))
+        return colored_part(columns, np.zeros(0, np.int64), np.zeros(0, np.int64), {}, loading)
     colors, notes = colors_of(columns) or (None, [])
     loading.say(*notes)
-    if not text["f sizes"]:
-        normals = _table(text["vn"], 3) if len(text["vn"]) == len(text["v"]) else None
-        material = make_material(0.5 if colors is None else 1.0)
-        none = np.zeros((0, 3), np.int64)
-        return [Part(positions=stack_columns(columns), faces=none, material=material, normals=normals, colors=colors)]
     library: dict[str, dict[str, str]] = {}
     for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+(?!#)", names.strip())):
         library |= parse_mtl(loading.read(name.partition(" #")[0]) or b"")
@@ -79,7 +78,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 def _parse(content: str) -> Rests:
     """Lines by keyword, without it; faces as all corners (words like 1/2/3, from 1), sizes and materials."""
-    found: Rests = {keyword: [] for keyword in ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf")}
+    keywords = ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf", POLYPAINT)
+    found: Rests = {keyword: [] for keyword in keywords}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     for line in content.replace("\\\n", " ").splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
@@ -98,32 +98,30 @@ def _parse(content: str) -> Rests:
     return found
 
 
-def _table(rows: list[str], width: int | None) -> np.ndarray:
-    """The first `width` numbers of each row, or all: (rows, width)."""
-    columns = None if width is None else range(width)
-    plain = [UNDEFINED.sub("nan", row) if "n" in row or "#" in row else row for row in rows]
-    return np.loadtxt(plain, usecols=columns, ndmin=2, comments="#") if rows else np.zeros((0, width or 3))
+def _table(rows: list[str], width: int, keyword: str) -> np.ndarray:
+    """The first `width` numbers of each row (rows, width)."""
+    numbered = [(number, row.partition("#")[0]) for number, row in enumerate(rows, 1)]
+    return load_text(numbered, keyword, width, ndmin=2, usecols=range(width)) if rows else np.zeros((0, width))
 
 
 def _columns(text: Rests, loading: Loading) -> Columns:
     """Columns of the vertices: positions and, if present, colours; white where only some have one (Blender)."""
-    try:
-        table = _table(text["v"], None)
-    except ValueError as error:
-        if "number of columns" not in str(error):
-            raise
-        rows = [row.partition("#")[0] for row in text["v"]]
-        lengths = np.array([len(row.split()) for row in rows])
-        if {*lengths} != {3, 6}:
-            message = "has vertices of different lengths: it is broken, or give colours to all of them"
-            raise UserError(message) from None
-        bare = lengths == 3
+    rows = [row.partition("#")[0] for row in text["v"]]
+    lengths = np.array([len(row.split()) for row in rows], np.int64)
+    bare = lengths == (3 if {*lengths} == {3, 6} else 0)
+    table = _table(
+        [row + " nan nan nan" * int(none) for row, none in zip(rows, bare, strict=True)],
+        int(lengths.max(initial=3)),
+        "v",
+    )
+    if bare.any():
         loading.say(f"{bare.sum():,} of {len(rows):,} vertices have no colour: white taken")
-        table = _table([row + " nan nan nan" * int(none) for row, none in zip(rows, bare, strict=True)], None)
         table[bare, 3:] = full_scale(table.dtype, float(table[~bare, 3:].max()))
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
-    return dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    painted = np.frombuffer(bytes.fromhex("".join(text[POLYPAINT])), np.uint8)[: 4 * len(table)].reshape(-1, 4)
+    columns = dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    return columns | (dict(zip(SRGB, painted.T[1:], strict=True)) if len(painted) == len(table) else {})
 
 
 def _parts(
@@ -139,8 +137,8 @@ def _parts(
             raise UserError(f"has faces that name {keyword} {last} of {count}: broken file")
     of_v, of_vt, of_vn = corners.T - 1
     positions, colors = positions[of_v], None if colors is None else colors[of_v]
-    texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2)[of_vt]  # a 1-D coordinate gets v = 0
-    normals = _table([*text["vn"], "0 0 0"], 3)[of_vn]
+    texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2, "vt")[of_vt]  # a 1-D coordinate gets v = 0
+    normals = _table([*text["vn"], "0 0 0"], 3, "vn")[of_vn]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
     number = {name: i for i, name in enumerate(looks)}
     has = (corners[faces] > 0).all(axis=1)  # (f, 3): positions, texture coordinates, normals

@@ -12,18 +12,19 @@ crowd    no panel at an end: share of the points within BASE of either end (the 
 72 of 78 real objects are found upright as they are, and 71 turned to z up (docs/lab/readers.md); `--up` overrides it.
 
 PCD headers and PLY camera elements may give the position of a sensor; normals are turned towards it, and a camera's
-axes give the up axis.  PCD writers put 0 0 0 if it is unknown: this is used only if nearly all points are visible from
-it, another position if most are.
+axes give the up axis.  Writers put 0 0 0 if it is unknown: this is used only if nearly all points are visible from it,
+another position if most are.
 """
 
 from collections.abc import Callable
+from io import BufferedIOBase
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from spnr_jax.formats.row_files import element_pieces, read_header
+from spnr_jax.formats.row_files import Header, element_pieces, read_header
 from spnr_jax.surfels.normals import estimate_normals, find_visible, measure_spacing
 
 ROTATIONS = {  # up axis of the file -> rotation (rows) that maps it to y
@@ -100,40 +101,34 @@ class Sensor(NamedTuple):
 
 def sensor_of(path: Path, kind: str, positions: np.ndarray, report: Callable[[str], None]) -> Sensor | None:
     """The sensor of a file with these points (n, 3); ValueError for a header that cannot be read."""
-    if kind == ".ply":
-        return _camera_of(path)
-    if kind != ".pcd":
+    if kind not in (".ply", ".pcd"):
         return None
     with path.open("rb") as file:
         header = read_header(file, kind)
-    if header.sensor is None or max(map(abs, header.sensor)) > FARTHEST:
+        place, up = (header.sensor, None) if kind == ".pcd" else _camera(file, header)
+    if place is None or not (np.abs(place) < FARTHEST).all():
         return None
-    place = np.array(header.sensor)
+    place = np.array(place)
     if header.organised or _from_there(positions, place, OPEN):
         # a depth image is in its camera's axes: y down, looking along z; or y up, looking along -z
         way = np.median(positions - place, axis=0)
         ahead = way[2] / max(float(np.linalg.norm(way)), np.finfo(np.float64).tiny)
-        return Sensor(place, None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y")
+        return Sensor(place, up or (None if abs(ahead) < AHEAD else "-y" if ahead > 0 else "y"))
     if place.any():
         if _from_there(positions, place, MOST, within=True):
-            return Sensor(place)
+            return Sensor(place, up)
         report(f"the place of the sensor left out: from {' '.join(f'{x:g}' for x in place)} few points are seen")
     return None
 
 
-def _camera_of(path: Path) -> Sensor | None:
-    """The camera in the first element of a PLY file."""
-    with path.open("rb") as file:
-        header = read_header(file, ".ply")
-        if [name for name, _, _ in header.elements][:1] != ["camera"]:
-            return None
-        _, columns, _ = next(element_pieces(file, header, "camera"))
+def _camera(file: BufferedIOBase, header: Header) -> tuple[np.ndarray | None, str | None]:
+    """The place and up axis of the camera in the first element of a PLY file, None where unknown."""
+    if [name for name, _, _ in header.elements][:1] != ["camera"]:
+        return None, None
+    _, columns, _ = next(element_pieces(file, header, "camera"))
     place, above = (np.array([columns.get(name, [np.nan])[0] for name in names], float) for names in (PLACE, UP))
-    if not (np.abs(place) < FARTHEST).all():
-        return None
-    if not (np.isfinite(above).all() and above.any()):
-        return Sensor(place)
-    return Sensor(place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)))
+    known = np.isfinite(above).all() and above.any()
+    return place, max(ROTATIONS, key=lambda axis: float(np.array(ROTATIONS[axis][1]) @ above)) if known else None
 
 
 def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: bool = False) -> bool:

@@ -44,9 +44,10 @@ MAGIC = (
 )
 TEXTS = (
     (rb"(?i)solid\b[^\0]*?\b(facet|endsolid)\b", (".stl",)),
-    (BLANK + rb"(ST)?C?N?4?n?OFF(?=\d|\b)", (".off",)),
+    (BLANK + rb"(ST|C|N)*4?n?OFF(?=\d|\b)", (".off",)),
     (BLANK + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", (".obj",)),
     (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
+    (BLANK + rb"x[\s,;]+y[\s,;]+z\b", TEXT),
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
@@ -76,7 +77,7 @@ FOREIGN = (
     ("a grid of heights (ESRI ASCII)", "", rb"ncols", "convert it with `gdal_translate -of XYZ`"),
     ("COLMAP's or another program's binary", ".bin", b"", "convert it with `colmap model_converter`, or " + ARRAYS),
     ("", ".pt .pth .pkl .h5 .hdf5 .mat .parquet", b"", ARRAYS),
-    ("", ".xlsx", b"", "save it as .csv"),
+    ("", ".xlsx .xls .ods", b"", "save it as .csv"),
     ("a pointer to a file of Git LFS", "", rb"version https://git-lfs", "fetch it with `git lfs pull`"),
     ("a web page", "", rb"(?i:<(?:!doctype )?html)", "download the file itself"),
     ("a picture or document", "", rb"\x89PNG|\xff\xd8\xff|%PDF", "give points or a mesh"),

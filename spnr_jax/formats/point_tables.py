@@ -1,8 +1,8 @@
 """Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
 
 Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
-or if something else separates the numbers.  Lines of a single integer are counts of points.  A
-header line, also one after #, % or //, names the columns; columns without a name, and columns of words, are not read.
+or if something else separates the numbers; 1.234,5 has a thousand.  Lines of a single integer are counts of points.  A
+header line, also one after #, % or //, names the columns; columns without a name, or of words, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 
     .npz    named arrays (points, c) or (points,); an array of positions may have more columns, as in text
@@ -42,7 +42,6 @@ Line = tuple[int, str]  # line number in the file, from 1, and text
 
 COLOR = ("r", "g", "b")
 OPAQUE = (1, 255, 65535)  # usual constant values of alpha
-NUMBERS = "fiu"  # dtype kinds of real numbers
 UNIT_LENGTH = 0.02  # tolerance of the length of a normal
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of sRGB (BT.601)
 CLOSE = 0.15  # difference of correlations below which the choice of colour columns is reported as ambiguous
@@ -51,11 +50,16 @@ PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text, and of an array, in memory a
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line shown in errors, and searched for names
 MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names; columns of an unnamed table
 COMMENTS = ("#", "//", "%")
-NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)([ed][+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+# separators of thousands, if a semicolon separates the numbers, and if not; the last mark in 1.234,5 is the decimal one
+THOUSANDS = (re.compile(r"(?<=\d)(['’\ufffd\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"))
+PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a missing number
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
+FORTRAN, WHOLE = re.compile(r"(?<=[\d.])d(?=[+-]?\d)", re.IGNORECASE), re.compile(r"\.0+(?![\d.ed])", re.IGNORECASE)
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
 INDEX = "index"  # name of a column that is not used
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can declare any size
@@ -66,11 +70,12 @@ UNNAMED = tuple(f"arr{i}" for i in range(9))  # np.savez's names of arrays passe
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; a line above the numbers may name them."""
     with open_text(path) as file:
-        numbered = ((number, _unquote(line.strip().replace("|", ";"))) for number, line in enumerate(file, 1))
+        numbered = ((number, _plain(line)) for number, line in enumerate(file, 1))
         before, first = _split_header(numbered)
         if not first[1]:
             remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
-            raise UserError(f"holds 0 points: no row of numbers, only {remark[:SHOWN]!r}")
+            wanted = "expected rows of numbers, with a line of names above them if they begin with words"
+            raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
         parts = first[1].split()
         if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
@@ -91,13 +96,14 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         names: tuple[str, ...] = ()
         found = 0
         words = [word.replace(",", ".") for word in first[1].split(delimiter)]
-        unread = {i: lambda word: np.nan for i, word in enumerate(words) if not _is_number(word)}
+        unread = {i: _packed_color for i, word in enumerate(words) if not _is_number(word)}
         while rows := list(islice(lines, PIECE_LINES)):
             found += len(rows)
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
-            names = names or _names(before, table, path.suffix.lower(), report)
-            if {names[i] for i in unread} & {*"xyz", *COLOR}:
-                raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+            if not names:
+                names = _names(before, table, path.suffix.lower(), report)
+                of_words = {i: "rgb" if PACKED.fullmatch(words[i]) else f"{names[i]} (words)" for i in unread}
+                names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
@@ -118,15 +124,27 @@ def encoding_of(head: bytes) -> str:
     return "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
-def _unquote(text: str) -> str:
-    """The line without quotes; commas inside quotes are decimal ones."""
-    return re.sub('"([^"]*)"?', lambda found: found[1].replace(",", "."), text) if '"' in text else text
+def _plain(line: str) -> str:
+    """The line without brackets, quotes and separators of thousands; commas inside quotes are decimal ones."""
+    if PLAIN.fullmatch(text := line.strip()):
+        return text
+    text = text.strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
+    if text[:1] in ("[", "(", "{"):
+        text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
+    if '"' in text:
+        text = re.sub('"([^"]*)"?', lambda found: THOUSANDS[0].sub("", found[1]).replace(",", "."), text)
+    return THOUSANDS[";" not in text].sub("", text)
 
 
 def _words(line: str) -> list[str]:
     """The fields of a line."""
     mark = next((mark for mark in ";," if mark in line), None)
     return [word.strip("' \t") for word in (line.split(mark) if mark or "\t" not in line else re.split(r"\t+", line))]
+
+
+def _packed_color(word: str) -> float:
+    """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
+    return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:
@@ -162,7 +180,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
-    texts = [UNDEFINED.sub("nan", text) for text in texts]
+    texts = [FORTRAN.sub("e", WHOLE.sub("", UNDEFINED.sub("nan", text))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)
     for (number, text), plain in zip(rows, texts, strict=True):
@@ -185,7 +203,8 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
             names = text.lower().split()
         while len(names) > filled and not names[-1]:
             names.pop()
-        is_remark = line.startswith(COMMENTS) or NUMBER.match(line)
+        # V1, V2 ... of R and Matlab name nothing
+        is_remark = line.startswith(COMMENTS) or NUMBER.match(line) or len({re.sub(r"\d", "", x) for x in names}) == 1
         if filled <= len(names) <= count and (name_places(names) or not is_remark):
             found.append(names)
         elif "x" in names and not is_remark:
@@ -208,20 +227,21 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
 
     Normals are the first three columns that can be; colours the three most correlated ones that can be.
     """
-    count = table.shape[1] if table.ndim == 2 and table.dtype.kind in NUMBERS else 0
+    count = table.shape[1] if table.ndim == 2 and table.dtype.kind in "fiu" else 0
     if count < 3 or count > MOST_COLUMNS:
         raise UserError(
             f"has numbers of shape {table.shape} and type {table.dtype} without column names; expected rows of x y z "
             "(then intensity, r g b, nx ny nz, roughness metallic), or a header line that names the columns"
         )
     steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
-    timed = count in (4, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
+    timed = steps.min() > 0 and steps.std() < steps.mean() / 2
     whole = (table % 1 == 0).all(axis=0)
     pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # pixels: row and column first
     first = 2 if pictured else int(timed or np.all(steps == 1))
     if first and count - first != 5:  # five columns after it: x of a profile, then y z r g b
         report(
-            f"columns before x y z, which number or time the points: {first} (if not, name the columns in a first line)"
+            f"columns before x y z, which number or time the points: {first}; "
+            "if that is wrong, or y comes before x, name the columns in a first line"
         )
         return (*first * [INDEX], *plain_names(table[:, first:], report))
     if (known := np.isfinite(table).all(axis=1)).any():
@@ -234,15 +254,18 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         alike = {i: _likeness(table, i) if len(table) > 2 else 0.0 for i in colored}
         start = max(colored, key=alike.__getitem__)
         names[start : start + 3] = COLOR
-        close = [i for i in colored if i != start and 0 < alike[start] - CLOSE < alike[i]]
         rest, left = table[:, start + 3 :], count - start - 3
         share = rest.min(initial=0) >= 0 and rest.max(initial=0) <= 1 and not np.all(rest % 1 == 0)
         if left == 1 and (np.isin(rest, OPAQUE).all() or (share and table[:, 3:].max() <= 1 and np.median(rest) == 1)):
             names[-1] = "alpha"
         if left == 2 and share:
             names[-2:] = "roughness", "metallic"
+        close = [
+            i for i in colored if i != start and alike[i] > alike[start] - CLOSE and "alpha" not in names[i : i + 3]
+        ]
     if names[3:4] == ["scalar"]:
-        names[3] = "intensity"
+        packed = count == 4 and whole[3] and OPAQUE[-1] < np.median(table[:, 3]) <= table[:, 3].max() < 2**24
+        names[3] = "rgb" if packed else "intensity"
     if count > 3:
         others = [f"; r g b may as well be columns {i + 1} to {i + 3}: name them in a first line" for i in close[:1]]
         report(f"the {count} columns, which have no names, taken as {' '.join(names)}{''.join(others)}")
@@ -291,10 +314,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
             tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
             yield _archive_columns(tables, report)
             return
-    if not magic.startswith(b"\x93NUMPY"):
-        raise UserError("is not a NumPy file")
-    advice = "save arrays, as np.savez(file, points=..., colors=...)"
-    broken = f"is a broken, truncated or pickled NumPy file: {advice}"
+    broken = "is a broken, truncated or pickled NumPy file: save arrays, as np.savez(file, points=..., colors=...)"
     try:
         with _parsing(broken):
             rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
@@ -302,8 +322,6 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         raise UserError(broken) from None
     if rows.ndim == 3 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    if not rows.dtype.itemsize:
-        raise UserError("holds records without bytes; expected points")
     fields = rows.dtype.names
     rows = rows.reshape(-1) if fields else _as_rows(rows, report)
     names = fields or plain_names(rows[:PIECE_LINES], report)

@@ -4,7 +4,8 @@
         a list `texcoord` per face, or s t or u v per vertex (MeshLab, OpenMVS)
 .stl    text: three lines `vertex x y z` per triangle; binary: 80 bytes, a count u32, 50 bytes per triangle; a count of
         0 means as many as fit
-.off    [[C][N]OFF], counts, vertices x y z [normal] [colour], faces n i j k ... [colour]; colours also without the C
+.off    [[C][N]OFF], counts, vertices x y z [normal] [colour], in MeshLab's NCOFF the colour first, faces n i j k ...
+        [colour]; colours also without the C
 """
 
 import io
@@ -16,14 +17,14 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import SRGB_TABLE, Loading, Part, decode_texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
-from spnr_jax.formats.point_tables import open_text
+from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.row_files import Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-OFF_HEAD = re.compile(r"(?:(?:ST)?(C?)(N?)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
+OFF_HEAD = re.compile(r"(?:((?:ST|C|N)*)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
 
 
 def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
@@ -47,7 +48,7 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     told = header.textures or any("texture" in name for name, *_ in header.elements)
     if texcoords is not None or "texcoord" in lists or told:
         loading.ignored.add("texture coordinates")
-    return _colored(vertices, corners, sizes, of_faces, loading)
+    return colored_part(vertices, corners, sizes, of_faces, loading)
 
 
 def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray | None:
@@ -90,26 +91,25 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     data = path.read_bytes()
     announced = int.from_bytes(data[80:STL_HEAD], "little")
     whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # then it is binary, whatever its first bytes
-    if not whole and re.match(rb"(\xef\xbb\xbf)?\s*solid\b[^\0]*?\b(facet|endsolid)\b", data, re.IGNORECASE):
-        corners = np.fromstring(b" ".join(re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)), sep=" ")
+    if not whole and re.match(rb"(\xef\xbb\xbf)?\s*(solid|facet)\b[^\0]*?(facet|endsolid|vertex)", data, re.IGNORECASE):
+        rows = [row.decode("ascii", "replace") for row in re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)]
+        corners = load_text([*enumerate(rows, 1)], "vertex", 3, ndmin=2) if rows else np.zeros((0, 3))
         if not re.search(rb"(?i)\bendsolid\b", data):
             loading.say("no line 'endsolid' ends the file: it may be cut off")
-        if len(corners) % 9:
-            raise UserError(f"is cut off: {len(corners)} coordinates, where each triangle has 9")
+        if len(rows) % 3:
+            raise UserError(f"is cut off: {len(rows)} corners, where each triangle has 3")
     else:
-        if len(data) < STL_HEAD:
-            raise UserError(f"is cut off: a binary STL file has {STL_HEAD} bytes before its triangles")
         held = (len(data) - STL_HEAD) // STL_TRIANGLE.itemsize
-        if announced > held:
-            raise UserError(f"is cut off: its header announces {announced} triangles, {held} are there")
+        if announced > held or held < 0:
+            raise UserError(f"is cut off: its header announces {announced} triangles, {max(held, 0)} are there")
         if held > announced:
             read = announced or held
             loading.say(f"the header announces {announced} triangles, {held} stand behind it, {read} are read")
-        rows = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
-        corners = rows["corners"]
-        loading.ignored |= {"colours in STL"} if rows["attribute"].any() or b"COLOR=" in data[:80] else set()
+        table = np.frombuffer(data, STL_TRIANGLE, announced or held, STL_HEAD)
+        corners = table["corners"]
+        loading.ignored |= {"colours in STL"} if table["attribute"].any() or b"COLOR=" in data[:80] else set()
     columns = dict(zip("xyz", corners.reshape(-1, 3).T, strict=True))
-    return _colored(columns, np.arange(corners.size // 3), np.full(corners.size // 9, 3), {}, loading)
+    return colored_part(columns, np.arange(corners.size // 3), np.full(corners.size // 9, 3), {}, loading)
 
 
 def load_off(path: Path, loading: Loading) -> list[Part]:
@@ -123,8 +123,10 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     num_vertices, num_faces = (int(word) for word in counts.split()[:2])
     if len(rows) < num_vertices + num_faces:
         raise UserError(f"is cut off: {num_vertices} vertices and {num_faces} faces announced, {len(rows)} lines found")
-    names = [*"xyz", *(NORMAL if head[2] else ()), *SRGB, "alpha"]
-    table = np.loadtxt(rows[:num_vertices], ndmin=2) if num_vertices else np.zeros((0, 3))
+    kind, color = head[1] or "", [*SRGB, "alpha"]
+    names = [*"xyz", *(NORMAL if "N" in kind else ()), *color] if "NC" not in kind else [*"xyz", *color, *NORMAL]
+    vertices = [*enumerate(rows[:num_vertices])]
+    table = load_text(vertices, "vertex", len(rows[0].split()), ndmin=2) if vertices else np.zeros((0, 3))
     columns = dict(zip(names, table.T, strict=False))
     faces = [[float(word) for word in row.split()] for row in rows[num_vertices:][:num_faces]]
     sizes = np.array([int(face[0]) for face in faces], np.int64)
@@ -135,15 +137,14 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
-        palette = all(len(values) == 1 for values in behind)
-        loading.ignored.add("colours of faces by a palette" if palette else "colours of some faces alone")
-    return _colored(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
+        loading.ignored.add("colours of some faces alone, or by a palette")
+    return colored_part(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
 
 
-def _colored(
+def colored_part(
     vertices: Columns, corners: np.ndarray, sizes: np.ndarray, of_faces: Columns, loading: Loading
 ) -> list[Part]:
     """The part of polygons with `sizes` corners each, coloured by its vertices, else by its polygons."""

@@ -40,7 +40,6 @@ BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 LONGEST_LIST = 2**20  # items
 PLY_LIMIT, PCD_LIMIT = 2**20, 2**16  # bytes of a header
 POINT_LIMIT = 2**16  # bytes of a point: histograms have hundreds of numbers; NumPy crashes on records of 2 GiB
-ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 KINDS = {"F": "<f", "I": "<i", "U": "<u"}
 LONGEST_LITERAL = 32  # LZF: a control byte c < 32 precedes c + 1 literal bytes; others copy earlier bytes
@@ -154,6 +153,7 @@ class Header(NamedTuple):
     textures: tuple[str, ...] = ()  # file names in MeshLab's comments
     organised: bool = False  # one point per pixel of a depth camera
     sensor: tuple[float, ...] | None = None  # its position; often 0 0 0 if unknown
+    carriage: bool = False  # lines of a text end in a bare \r
 
     @property
     def faces(self) -> str | None:
@@ -185,19 +185,19 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
             if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
                 raise UserError(f"has lists of several lengths: {list_names([*fields])}")
             yield columns | name_columns({name: x.reshape(len(sizes), -1) for name, (sizes, x) in fields.items()})
-        name, count, properties = header.elements[-1]
-        held, begin = 0, file.tell()
-        if name == "vertex" and header.encoding == "ascii":
-            held = sum(1 for _ in _lines(file))
-        elif name == "vertex" and not any(isinstance(width, str) for *_, width in properties):
-            held = (file.seek(0, SEEK_END) - begin) // max(1, _layout(properties, {})[0].itemsize)
-        if held:
+        (name, count, properties), begin = header.elements[-1], file.tell()
+        if name != "vertex" or any(isinstance(width, str) for *_, width in properties):
+            return
+        size = max(1, _layout(properties, {})[0].itemsize)
+        binary = header.encoding == "binary"
+        if held := (file.seek(0, SEEK_END) - begin) // size if binary else sum(1 for _ in _lines(file)):
             report(f"the header announces {count:,} points, {held:,} more stand behind them and are not read")
 
 
 def element_pieces(file: BufferedIOBase, header: Header, *wanted: str) -> Iterator[tuple[str, Columns, Lists]]:
     """(name, columns, lists) of the wanted elements of a PLY file at its data, in file order, some rows at a time."""
     left = set(wanted)
+    file = BytesIO(file.read().replace(b"\r", b"\n")) if header.carriage else file
     for name, count, properties in header.elements:
         for columns, lists in read_rows(file, count, properties, header.encoding == "ascii") if left else ():
             if name in left:
@@ -231,22 +231,22 @@ def _ply_header(file: BufferedIOBase) -> Header:
     newline = re.search(rb"\r\n|\n|\r", data)
     # after a header with \r line ends, the first byte of data may be a \n
     end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + newline[0], data) if newline else None
-    if not data.removeprefix(BOM_UTF8).startswith(b"ply") or end is None:
+    if newline is None or end is None or not data.removeprefix(BOM_UTF8).startswith(b"ply"):
         raise UserError("is not a PLY file, or its header is cut off (expected 'ply' ... 'end_header')")
     order: str | None = None
     textures: list[str] = []
     elements: list[tuple[str, int, Properties]] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
-        match line.split():
+        match line.lower().split():
             case ["format", name, _]:
                 order = BYTE_ORDERS.get(name)
             case ["element", name, count] if count.isdecimal():
                 elements.append((name, int(count), []))
             case ["property", "list", length, items, name] if elements and {length, items} <= TYPES.keys():
-                elements[-1][2].append((name.lower(), TYPES[items], TYPES[length]))
+                elements[-1][2].append((name, TYPES[items], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1][2].append((name.lower(), TYPES[kind], 1))
-            case ["comment", "TextureFile", *_]:
+                elements[-1][2].append((name, TYPES[kind], 1))
+            case ["comment", "texturefile", *_]:
                 textures.append(line.split(None, 2)[-1].strip())
             case [] | ["comment" | "obj_info", *_]:
                 pass
@@ -258,7 +258,8 @@ def _ply_header(file: BufferedIOBase) -> Header:
     for _, _, own in elements:  # "float" in ASCII is read as f8: the text may have more digits
         own[:] = [(name, order + kind, order + width if isinstance(width, str) else width) for name, kind, width in own]
         own[:] = [(name, kind.replace("=f4", "=f8"), width) for name, kind, width in own]
-    return Header("ascii" if order == "=" else "binary", elements, tuple(textures))
+    text = order == "="
+    return Header("ascii" if text else "binary", elements, tuple(textures), carriage=text and newline[0] == b"\r")
 
 
 def _pcd_header(file: BufferedIOBase) -> Header:
@@ -269,10 +270,8 @@ def _pcd_header(file: BufferedIOBase) -> Header:
     entries: dict[str, list[str]] = {}
     for line in data[: end.end()].decode("utf-8-sig", "replace").splitlines():
         word, *values = line.split() or ["#"]
-        if word not in ENTRIES and not word.startswith("#"):
-            raise UserError(f"has a PCD header line that is not understood: {line.strip()!r}")
-        entries[word] = values
-    if (encoding := end[1].decode("ascii", "replace")) not in ENCODINGS:
+        entries[word.upper().replace("COLUMNS", "FIELDS")] = values
+    if (encoding := end[1].decode("ascii", "replace").lower()) not in ENCODINGS:
         raise UserError(f"has PCD data of kind {encoding!r}; expected one of {', '.join(ENCODINGS)}")
     try:
         names = entries["FIELDS"]

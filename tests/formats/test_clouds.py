@@ -74,10 +74,10 @@ def test_packed_colours_are_whole_numbers_of_any_type_or_have_their_bits(tmp_pat
     [("roughness", "scalar_metallic"), ("scalar_roughness", "metalness"), ("pbr_roughness", "metal")],
 )
 def test_roughness_and_metallic_have_many_names_and_whole_bytes(tmp_path, rough, metal):
-    _, roughness, metallic, lines = materials(tmp_path, **{rough: np.uint8([0, 255, 0]), metal: [0.25, 0.75, 0]})
+    _, roughness, metallic, lines = materials(tmp_path, **{rough: [0, 255, 0], metal: [0.25, 0.75, 0]})
     np.testing.assert_array_equal(roughness, [0, 1, 0])
     np.testing.assert_array_equal(metallic, [0.25, 0.75, 0])
-    assert lines == ["no base_color in the file: 0.5 taken for all points"]
+    assert lines == ["roughness taken to be in 0..255", "no base_color in the file: 0.5 taken for all points"]
 
 
 def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is(tmp_path):

@@ -71,10 +71,11 @@ def test_the_viewpoint_that_every_writer_puts_there_is_believed_if_nothing_hides
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_the_camera_of_a_ply_file_gives_the_sides_of_the_points_and_the_way_up(tmp_path, form):
-    placed = place_cloud(ply(tmp_path, form, [0, 0, 0, 0.1, -0.9, 0.2]))
+    placed = place_cloud(ply(tmp_path, form, [0, 0.01, 0, 0.1, -0.9, 0.2]))
     assert placed.up == "-y"
     normals = placed.cloud.normals @ placed.rotation
     np.testing.assert_allclose(normals, -spiral(300), atol=0.1)  # seen from within
+    assert read_cloud(ply(tmp_path, form, [0, 0, 0, 0, 1, 0])).normals is None  # as MeshLab puts it if it knows none
 
 
 def table() -> np.ndarray:

@@ -23,7 +23,7 @@ from spnr_jax.surfels.sides import spiral
 
 PIECED = ("ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "a.xyz", "a.csv", "a.npy", "a.las")
 ANNOUNCED = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd npy npz las laz off glb"]
-ROUGH = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd xyz csv npy npz"]
+ROUGH = [name for name in WRITERS if name.rpartition(".")[2] in "ply pcd xyz csv npy npz las laz"]
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -70,11 +70,26 @@ def test_what_says_how_much_it_holds_is_refused_wherever_it_is_cut(tmp_path, nam
 # Text
 
 
+def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=pickled)
+    return stream.getvalue()
+
+
+def archive(member: bytes) -> bytes:
+    """An .npz archive that holds these bytes as its points."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        file.writestr("points.npy", member)
+    return stream.getvalue()
+
+
 ROWS = [(*point, *GREEN) for point in BALL.tolist()]
 
 
 def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> str:
-    text = "\n".join(separator.join(f"{value:.9g}" for value in row) + end for row in columns) + "\n"
+    rows = [[value if isinstance(value, str) else f"{value:.9g}" for value in row] for row in columns]
+    text = "\n".join(separator.join(row) + end for row in rows) + "\n"
     return text.replace(".", ",") if comma else text
 
 
@@ -88,9 +103,13 @@ PACKED = [(*row[:3], (GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) - 2**24) for ro
 PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
 WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
-PCL = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ascii\n"
+PCL = "VERSION .7\nCOLUMNS x y z rgb\nsize 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+FLOATS = [(*row[:3], 40.0, 170.0, 60) for row in ROWS]
+THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROWS]
+GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
+LOUD, V_NAMES = ply_bytes("ascii", rows=FLOATS, properties=XYZRGB).replace(b"float", b"Float"), "V1 V2 V3 V4 V5 V6\n"
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
@@ -115,6 +134,15 @@ TEXTS = {
     "names of a map behind a mark": ("a.txt", "#N,E,Elev,R,G,B\n" + table(",", columns=NORTHING)),
     "tabs that align": ("a.txt", "x\t\ty\tz\t\tr\tg\tb\n" + table("\t")),
     "tabs and blanks": ("a.txt", "x y z\tr g b\n" + table(" ")),
+    "names in German, as Excel writes them": ("a.csv", GERMAN.encode("cp1252")),
+    "names by number, of R, and numbers of Fortran": ("a.txt", V_NAMES + table(" ").replace(" ", "D+00 ")),
+    "brackets around each row": ("a.txt", "[[" + table(", ").replace("\n", "],\n[")),
+    "thousands, Swiss": ("a.txt", table(" ", columns=THOUSANDS).replace(",", "'")),
+    "thousands, German": ("a.txt", table(";", columns=THOUSANDS).translate({44: ".", 46: ","})),
+    "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
+    "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
+    "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
+    "names in any file, minus signs": ("a.prn", "  X Y Z R G B\n" + table("  ").replace("-", "\N{MINUS SIGN}")),
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
@@ -139,7 +167,7 @@ TEXTS = {
     "a row undefined as on Windows": ("a.xyz", table(" ") + "-nan(ind) -1.#IND 0 1 2 3\n"),
     **{f"a table named {name}": (name, table(" ")) for name in ("a", "a.xyzrgb", "a.dat", "a.ply", "a.obj")},
     "grey: decimal commas in quotes": ("a.csv", QUOTED),
-    "a column of words": ("a.csv", "x,y,z,r,g,b,label\n" + table(",", ",chair")),
+    "a column of words": ("a.csv", "x,y,z,r,g,b,metallic\n" + table(",", ",true")),
     "words before the numbers": ("a.csv", WORDY),
     "fields that are not known": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "NA,1,1,1,2,3\nNULL,n/a,1,1,2,3\n"),
     "bars": ("a.txt", "x|y|z|r|g|b\n" + table("|")),
@@ -155,6 +183,9 @@ TEXTS = {
     "grey: OFF without its word": ("a.off", "420 0 0\n" + table(" ", columns=POINTS)),
     "grey: OFF with a byte order mark": ("a.off", "\ufeffOFF\n420 0 0\n" + table(" ", columns=POINTS)),
     "grey: PLY with a byte order mark": ("a.ply", BOM_UTF8 + ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
+    "grey: a PLY of bare CR in text": ("a.ply", ply_bytes("ascii", "\r", rows=POINTS, properties=DOUBLES)),
+    "PLY in capitals, bytes with a point": ("a.ply", LOUD),
+    "grey: NumPy of Python 2": ("a.npy", as_npy(BALL).replace(b"(420, 3), }  ", b"(420L, 3L), }")),
     "grey: a PLY under another name": ("a.txt", ply_bytes("ascii", rows=POINTS, properties=DOUBLES)),
 }
 
@@ -198,18 +229,16 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
     np.testing.assert_allclose(cloud.base_color, SRGB[colors], atol=1e-4)
 
 
-def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
-    four = 0.9 * np.random.default_rng(0).integers(0, 256, (420, 1)) + np.random.default_rng(1).uniform(0, 25, (420, 4))
-    _, lines = read(write(tmp_path, "a.txt", table(" ", columns=np.column_stack([BALL, np.round(four)]))))
-    assert "r g b may as well be columns 5 to 7: name them in a first line" in lines[0]
-
-
 @pytest.mark.parametrize(
     ("name", "data", "line"),
     [
         ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
         ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
-        ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar"),
+        (
+            "a.txt",
+            table(" ", columns=LABELED),
+            "the 7 columns, which have no names, taken as x y z r g b scalar; r g b may",
+        ),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         (
             "a.csv",
@@ -230,7 +259,7 @@ def test_where_colours_and_an_intensity_are_as_alike_it_is_said(tmp_path):
     ],
 )
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
-    assert line in read(write(tmp_path, name, data))[1]
+    assert any(found.startswith(line) for found in read(write(tmp_path, name, data))[1])
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
@@ -353,13 +382,6 @@ def test_a_scan_keeps_its_coordinates_and_colours_in_chunks_of_any_size_and_is_z
     np.testing.assert_allclose(placed.cloud.base_color, SRGB[WHOLE.levels], atol=1e-4)
 
 
-def test_a_scan_without_colours_shows_its_intensity_and_what_its_extra_bytes_say(tmp_path):
-    as_scan(tmp_path / "a.las", WHOLE, 6, Roughness=WHOLE.roughness)
-    cloud = read_cloud(tmp_path / "a.las")
-    assert np.ptp(cloud.base_color) > 0.9
-    np.testing.assert_allclose(cloud.roughness, WHOLE.roughness)
-
-
 def test_the_lowest_intensity_is_no_missing_colour(tmp_path):
     lowest = np.random.default_rng(0).random(420) < 0.3
     rows = [(*p, 0 if low else 50 + i % 40) for i, (p, low) in enumerate(zip(BALL.tolist(), lowest, strict=True))]
@@ -424,20 +446,6 @@ def test_points_behind_those_that_a_scan_announces_are_said(tmp_path, suffix, ki
 # What is refused
 
 
-def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array, allow_pickle=pickled)
-    return stream.getvalue()
-
-
-def archive(member: bytes) -> bytes:
-    """An .npz archive that holds these bytes as its points."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as file:
-        file.writestr("points.npy", member)
-    return stream.getvalue()
-
-
 PLY, PCD = b"ply\nformat ascii 1.0\n", WRITERS["binary.pcd"](WHOLE)
 POINTS = pack_arrays({"points": np.zeros((50, 3))})
 LITTLE, DEEP = "binary_little_endian", [(0.0, 0.0, 5e6), (0.0, 0.0, 5e6 + 1)]
@@ -451,7 +459,7 @@ REFUSED = [
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
-    ("a.xyz", "# nothing yet\n", "holds 0 points: no row of numbers, only 'nothing yet'"),
+    ("a.xyz", "# nothing yet\n", "holds 0 points: expected rows of numbers, .*; found 'nothing yet'"),
     ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS, .*git lfs pull"),
     ("a.ply", "<!DOCTYPE html>", "a web page, which is not read: download the file itself"),
     ("a.ply.gz", b"\x1f\x8b", "an archive, which is not read: unpack it first"),
@@ -466,19 +474,17 @@ REFUSED = [
     ("a.xyz", "1 2 3\n4 5 6\n" * 5, "holds 10 points in 2 places: no object"),
     ("a.xyz", "".join(f"{i} {2 * i} 0.1\n" for i in range(50)), "50 points on one straight line"),
     ("a.e57", b"ASTM-E57\1\0\0\0\0\0\0\0", "E57 of version 1.0, which is not read: convert it to .las"),
-    ("b.e57", b"ASTM-E57\1", "E57, which is not read: convert it to .las"),
     ("a.ply", b"PXR-USDC\0\x08\0", r"USD \(binary crate\) of version 0.8.0, .* Blender"),
     ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
     ("a.usdz", b"PK\3\4", r"USD \(package\), which is not read: convert it to .glb"),
     ("a.fbx", b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0", "FBX of version 7400, which is not read: convert it to"),
     ("a.dae", '<?xml version="1.0"?>\n<COLLADA xmlns="x" version="1.4.1">', "COLLADA of version 1.4.1, "),
-    ("a.pkl", b"\x80", "a .pkl file, which is not read: save its points"),
     ("a.spz", b"NGSP\4\0\0\0" + bytes(30), ".spz file of version 4; versions 2 and 3 can be read: convert"),
     ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
     ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
     ("a.ply", ply_bytes(LITTLE, rows=DEEP, properties=XYZRGB[:3]), "0.5 apart at best .* extent of 0.9; move"),
     ("a.ply", ply_bytes(LITTLE)[:-20], "announces 3 points, the data ends after 2"),
-    ("b.obj", "# nothing\n", "no faces, and no vertices"),
+    ("b.stl", "solid a\nendsolid a\n", "no faces, and no vertices"),
     ("a.ply", b"solid of something", "not a PLY"),
     ("a.ply", PLY + b"element vertex 1\nproperty quad x\nend_header\n1\n", "property quad x"),
     ("a.ply", b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "known format"),
@@ -489,15 +495,14 @@ REFUSED = [
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 " * 6 + "\n", r"shape \(1, 18\)"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
-    ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", "line 2: expected 3 numbers, found '1,2m,3'"),
+    ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", r"needs the properties x y z .*; found x y \(words\) z"),
     ("a.csv", "x,y,z\n0,5,1,5,2,5\n", "names 3 columns .* above 6 .*; decimal commas need another separator"),
     ("a.pcd", PCD.replace(b"TYPE F F U F F F", b"TYPE F F U F F"), "disagree"),
     ("a.pcd", PCD.replace(b"COUNT 1 1 3 1 1 1", b"COUNT 1 1 2147483647 1 1 1"), "bytes; expected at most"),
     ("a.pcd", PCD.replace(b"POINTS 12", b"POINTS -4"), "-4"),
     ("a.pcd", PCD.replace(b"DATA binary", b"DATA packed"), "packed"),
-    ("a.pcd", PCD.replace(b"HEIGHT 1", b"SHAPE 1"), "SHAPE"),
-    ("a.npy", pickle.dumps([1, 2]), "not a NumPy file"),
-    ("a.npy", as_npy(np.zeros(3, [("x", "<f4", (0,))])), "records without bytes"),
+    ("a.npy", pickle.dumps([1, 2]), "broken, truncated or pickled"),
+    ("a.npy", as_npy(np.zeros(3, [("x", "<f4", (0,))])), "needs the properties x y z"),
     ("a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 9001) + b"~" * 9000 + b"1", "a broken, truncated or pickled"),
     ("a.npy", as_npy(np.zeros(3, [(axis, "U1") for axis in "xyz"])), "needs the properties x y z"),
     ("a.npy", as_npy(np.zeros((5, 3))).replace(b"'shape'", b"'shape("), "broken"),
@@ -534,18 +539,3 @@ def test_a_data_set_with_a_broken_row_is_refused():
     rows = [(0.0, 1.0, 0.0), (0.0, np.nan, 0.0), (np.inf, 0.0, 0.0)]
     with pytest.raises(ValueError, match="holds 2 points with NaN, infinity .* first point 1"):
         clouds.cloud_of_ply(ply_bytes(LITTLE, rows=rows, properties=XYZRGB[:3]))
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
-def test_a_header_that_python_2_wrote_is_read_without_a_warning(tmp_path, name, recwarn):
-    stream = io.BytesIO()
-    np.save(stream, BALL)
-    content = stream.getvalue().replace(b"(420, 3), }  ", b"(420L, 3L), }")
-    assert b"420L" in content
-    if name == "a.npy":
-        (tmp_path / name).write_bytes(content)
-    else:
-        with zipfile.ZipFile(tmp_path / name, "w") as archive:
-            archive.writestr("points.npy", content)
-    np.testing.assert_allclose(read(tmp_path / name)[0].positions, BALL, atol=1e-6)
-    assert not recwarn.list

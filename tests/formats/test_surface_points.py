@@ -11,7 +11,7 @@ from support.handmade import plain
 
 from data_gen.render.variant import mitsuba_module
 from data_gen.render.views import bitmap_texture
-from spnr_jax.formats.assets import Asset, Part, decode_texels, lookup, read_image
+from spnr_jax.formats.assets import Asset, Part, decode_image, decode_texels, lookup
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
@@ -159,7 +159,7 @@ def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
 
 def test_sixteen_bit_grey_images_are_scaled_not_clipped():
     stream = png(np.zeros((1, 1, 3)))
-    assert read_image(stream, "black").tolist() == [[[0, 0, 0, 255]]]
+    assert decode_image(stream).tolist() == [[[0, 0, 0, 255]]]
     stream = io.BytesIO()
     Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
-    assert decode_texels(read_image(stream.getvalue(), "grey")[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
+    assert decode_texels(decode_image(stream.getvalue())[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]

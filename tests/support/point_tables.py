@@ -155,6 +155,6 @@ def written(folder, name, table):
     """A file of a table."""
     writer = WRITERS[name]
     if writer in (as_numpy, as_scan, as_scene):
-        writer(folder / name, table)
+        writer(folder / name, table, **({"Roughness": table.roughness} if writer is as_scan else {}))
         return folder / name
     return write(folder, name, writer(table))
