@@ -1,10 +1,10 @@
 """Entries of discs blended to a G-buffer: order-independent among entries of about the same depth.
 
-optical depth of an entry: CENTRE_TAU k^2 f, for its kernel k and its facing f (0.02 for a back face)
-groups        of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do not
-              occlude each other; from two spacings on, the front entry occludes the one behind
-blend weight  of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
-              transmittance before it; over all groups they add up to the opacity
+    optical depth  of an entry: CENTRE_TAU k^2 f, for its kernel k and its facing f (0.02 for a back face)
+    group          of a pixel's LIST_LENGTH front-most entries, those less than a spacing apart in depth blend and do
+                   not occlude each other; from two spacings on, the front entry occludes the one behind
+    blend weight   of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
+                   transmittance before it; over all groups they add up to the opacity
 """
 
 from collections.abc import Iterator
