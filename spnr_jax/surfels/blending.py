@@ -5,6 +5,8 @@
                    not occlude each other; from two spacings on, the front entry occludes the one behind
     blend weight   of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
                    transmittance before it; over all groups they add up to the opacity
+
+A *slot* is a covered pixel.  Lists are arrays (list, slots): the entries of each slot, front to back.
 """
 
 from collections.abc import Iterator
