@@ -51,6 +51,7 @@ SMALL, FINEST_OF_SMALL = 128, 1.6  # pixels along a side up to which a picture i
 MOST_DOUBLINGS = 4
 NEAREST = 0.5  # distance, in units of the box, at which an eye inside the object sees its points
 STEP, MARGIN = 32, 8  # pixels: a window's size is a multiple of STEP; MARGIN around the object
+BEYOND = 16  # pixels around the picture in which discs are drawn as well: the network sees what its border cuts
 GRID = 16  # a window's corner is a multiple: the network's pooling grid is the same from every camera
 LEAST_ENTRIES, LEAST_SLOTS = 2**15, 2**11  # that a plan holds
 
@@ -187,10 +188,10 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 @CachedProgram
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Plan:
     """What a view needs, as arrays; the covered pixels are bounded by the rectangles around the discs."""
-    whole = scale_camera(scene, camera, doublings, side)
-    foot = splatting.project_discs(scene.surfels, whole)
+    frame = frame_camera(scene, camera, doublings, side)
+    foot = splatting.project_discs(scene.surfels, frame)
     _, width, height = place_window(foot)
-    slots = splatting.bound_covered_pixels(foot, whole)
+    slots = splatting.bound_covered_pixels(foot, frame)
     sizes: Any = width, height, splatting.count_entries(foot.covered), slots
     return Plan(doublings, side, *sizes)
 
@@ -211,16 +212,20 @@ def _round_count(count: int, least: int) -> int:
     return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
 
 
-def scale_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) -> Camera:
-    """The camera in the box at the G-buffer's resolution; the doubled picture may exceed the image: it is cropped."""
+def frame_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) -> Camera:
+    """The camera in the box at the G-buffer's resolution, BEYOND pixels wider on each side.
+
+    The doubled picture may exceed the image: it is cropped.
+    """
     height, width = (-(-n * side // 2**doublings) for n in (camera.height, camera.width))
     scale = jnp.array([[side / 2**doublings], [side / 2**doublings], [1.0]], jnp.float32)
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
-    return dataclasses.replace(inside, intrinsics=camera.intrinsics * scale, height=height, width=width)
+    whole = dataclasses.replace(inside, intrinsics=camera.intrinsics * scale, height=height, width=width)
+    return crop_camera(whole, jnp.full(2, -BEYOND), width + 2 * BEYOND, height + 2 * BEYOND)
 
 
 def place_window(foot: Footprints) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
-    """Corner (column, row), width and height of the window around the discs; it may reach beyond the picture."""
+    """Corner (column, row), width and height of the window around the discs; it may reach beyond the frame."""
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
@@ -286,11 +291,11 @@ register(WindowBuffer)
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
-    whole = scale_camera(scene, camera, plan.doublings, plan.side)
-    foot = splatting.project_discs(scene.surfels, whole)
+    frame = frame_camera(scene, camera, plan.doublings, plan.side)
+    foot = splatting.project_discs(scene.surfels, frame)
     corner, width, height = place_window(foot)
     foot = splatting.move_to_window(foot, corner, plan.width, plan.height)
-    window = crop_camera(whole, corner, plan.width, plan.height)
+    window = crop_camera(frame, corner, plan.width, plan.height)
     buffer, overflow = rasterize(scene.surfels, foot, window, light, capacity=plan.entries, slots=plan.slots)
     beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
     return WindowBuffer(buffer, corner, jnp.minimum(overflow, splatting.MOST_COUNTED) + beyond)
@@ -306,13 +311,14 @@ def shade_window(
     plan: Plan,
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
-    whole = scale_camera(scene, camera, plan.doublings, plan.side)
-    window = crop_camera(whole, window_buffer.corner, plan.width, plan.height)
+    frame = frame_camera(scene, camera, plan.doublings, plan.side)
+    window = crop_camera(frame, window_buffer.corner, plan.width, plan.height)
     buffer = window_buffer.buffer
     given = shader.compute_inputs(buffer, light, window)
     layers = shade(params, given, buffer.depth, doublings=plan.doublings)
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
-    image, depth, acc = paste_window(layers, window_buffer.corner * 2**plan.doublings, inside, plan.side)
+    scale = 2**plan.doublings
+    image, depth, acc = paste_window(layers, window_buffer.corner * scale, inside, plan.side, BEYOND * scale)
     return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
 
@@ -352,13 +358,17 @@ def make_shader(params: dict) -> Shader:
 
 
 def paste_window(
-    layers: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int
+    layers: Float[AnyArray, "h w 5"], corner: Int[AnyArray, "2"], camera: Camera, side: int, beyond: int
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"], Float[Array, "height width"]]:
-    """Image, depth along rays and opacity of the whole picture: empty outside the window, which may extend beyond."""
+    """Image, depth along rays and opacity of the whole picture: empty outside the window.
+
+    The window's corner is counted from `beyond` pixels outside the picture, which it may exceed.
+    """
     height, width = (n * side for n in (camera.height, camera.width))
-    empty = jnp.zeros((height + layers.shape[0], width + layers.shape[1], 5), layers.dtype)
+    rows, columns = (n + 2 * beyond + size for n, size in zip((height, width), layers.shape, strict=False))
     start = (corner[1], corner[0], jnp.zeros((), corner.dtype))
-    sums = average_pool(jax.lax.dynamic_update_slice(empty, layers, start)[:height, :width], side)
+    pasted = jax.lax.dynamic_update_slice(jnp.zeros((rows, columns, 5), layers.dtype), layers, start)
+    sums = average_pool(pasted[beyond : beyond + height, beyond : beyond + width], side)
     acc = sums[..., 3]
     rays = cameras.camera_rays(camera)
     _, far, _ = cameras.intersect_box(rays.origins, rays.directions)

@@ -166,6 +166,17 @@ def test_a_plan_of_several_views_holds_each_and_changes_none():
         assert np.asarray(own.acc).max() > 0.9
 
 
+def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wobbled):
+    near, wider = camera(96, eye=(0.9, 0.6, 1.0)), 64
+    moved = near.intrinsics.at[:2, 2].add(wider)
+    large = dataclasses.replace(near, intrinsics=moved, height=96 + 2 * wider, width=96 + 2 * wider)
+    assert choose_resolution(scene, near) == choose_resolution(scene, large)
+    for variables, most in ((None, 1e-5), (wobbled, 0.02)):
+        own, cut = render(variables, scene, near), render(variables, scene, large)
+        assert np.asarray(own.acc)[0].max() > 0.9, "the border cuts the object"
+        close(own.image, np.asarray(cut.image)[wider:-wider, wider:-wider], atol=most)
+
+
 def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh):
     share = 0.75
     view = camera(64)
