@@ -60,7 +60,8 @@ def is_bug(error: Exception) -> bool:
 def first_line(error: Exception) -> str:
     """First line of an error message (libraries may append call stacks); the type if there is no message."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-    if found := re.match(r"(?:invalid literal|could not convert string).*?('[^']*')", line):  # Python's, NumPy's
+    python = re.match(r"(?:invalid literal for int\(\) with base \d+|could not convert string to float): (.*)", line)
+    if found := python or re.match(r"could not convert string ('.*') to \w+ at", line):  # the latter NumPy's
         return f"expected a number, found {found[1]}"
     return line
 

@@ -30,9 +30,10 @@ Report = Callable[[str], None]
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 LINEAR, SRGB = ("base_color_r", "base_color_g", "base_color_b"), ("red", "green", "blue")
 SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coefficients: sRGB = 0.5 + C0 * f_dc
-# ignored in names: CloudCompare's prefix, separators, umlauts, British spelling, and words such as `vertex`
+# ignored in names: CloudCompare's prefix, separators, umlauts (\ufffd: of another encoding), British spelling, and
+# words such as `vertex`
 SILENT = re.compile(
-    r"^scalar_|[\s.:_-]+|[^\x00-\x7f]|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
+    r"^scalar_|[\s.:_-]+|[äöüß\ufffd]|(?<=colo)u(?=r)|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
 )
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
@@ -109,7 +110,7 @@ def _differing(columns: Columns, words: str) -> list[str]:
 
 def rename(columns: Columns) -> Columns:
     """The columns in use under our names; packed colours need at least four bytes."""
-    plain = {plain_name(name): x for name, x in columns.items()} | columns
+    plain = {plain_name(name): x for name, x in reversed(columns.items())} | columns  # of equal names the first
     found: Columns = {}
     for ours, theirs in ALIASES.items():
         names = next((names for names in theirs if set(names) <= plain.keys()), [])
@@ -256,7 +257,7 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
 def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
     """Roughness or metallic in [0, 1] or of whole bytes, without rounding errors; ValueError if they lie outside."""
     highest = float(values.max(initial=0))
-    scale = full_scale(values.dtype, highest, linear=highest <= 100 or bool((values % 1).any()))
+    scale = full_scale(values.dtype, highest, linear=not 100 < highest <= 255 or bool((values % 1).any()))
     if scale > 1:
         report(f"{name} taken to be in 0..{scale:g}")
     scaled = values / scale

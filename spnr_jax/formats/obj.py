@@ -9,6 +9,7 @@ transparent   d below 1; map_d, cut out at 0.5; Tr strictly between 0 and 1 (wri
 Of faces with the same three corners, which ShapeNet has for the two sides, the one with the first material is kept.
 """
 
+import contextlib
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -107,21 +108,26 @@ def _table(rows: list[str], width: int, keyword: str) -> np.ndarray:
 def _columns(text: Rests, loading: Loading) -> Columns:
     """Columns of the vertices: positions and, if present, colours; white where only some have one (Blender)."""
     rows = [row.partition("#")[0] for row in text["v"]]
-    lengths = np.array([len(row.split()) for row in rows], np.int64)
-    bare = lengths == (3 if {*lengths} == {3, 6} else 0)
-    table = _table(
-        [row + " nan nan nan" * int(none) for row, none in zip(rows, bare, strict=True)],
-        int(lengths.max(initial=3)),
-        "v",
-    )
+    bare, table = np.zeros(len(rows), bool), np.zeros((0, 3))
+    with contextlib.suppress(ValueError):  # of words, or rows of several lengths
+        table = np.loadtxt(rows, ndmin=2) if all(rows) and rows else table
+    if len(table) != len(rows):
+        lengths = np.array([len(row.split()) for row in rows])
+        bare = lengths == (3 if {*lengths} == {3, 6} else 0)
+        whole = [row + " nan nan nan" * int(none) for row, none in zip(rows, bare, strict=True)]
+        table = _table(whole, int(lengths.max()), "v")
     if bare.any():
         loading.say(f"{bare.sum():,} of {len(rows):,} vertices have no colour: white taken")
         table[bare, 3:] = full_scale(table.dtype, float(table[~bare, 3:].max()))
     if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
         table = np.delete(table, 3, axis=1)
-    painted = np.frombuffer(bytes.fromhex("".join(text[POLYPAINT])), np.uint8)[: 4 * len(table)].reshape(-1, 4)
     columns = dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
-    return columns | (dict(zip(SRGB, painted.T[1:], strict=True)) if len(painted) == len(table) else {})
+    digits = "".join(text[POLYPAINT])[: 8 * len(table)]
+    if len(digits) == 8 * len(table) and re.fullmatch("[0-9a-fA-F]*", digits):
+        columns |= dict(zip(SRGB, np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 4).T[1:], strict=True))
+    elif digits:
+        loading.say(f"{POLYPAINT} (colours of ZBrush) is broken or cut off, and not used")
+    return columns
 
 
 def _parts(

@@ -102,7 +102,7 @@ def kind_of(path: Path) -> str:
     if not head:
         raise UserError(f"{path}: the file is empty")
     text = head.decode(encoding_of(head), "ignore").encode()
-    if kind := _told_kind(MAGIC, head.removeprefix(BOM_UTF8), suffix):
+    if kind := _match_kind(MAGIC, head.removeprefix(BOM_UTF8), suffix):
         return kind
     for name, suffixes, sign, advice in FOREIGN:
         begin = re.match(sign, head, re.DOTALL) if sign else None
@@ -111,13 +111,13 @@ def kind_of(path: Path) -> str:
             words = [x.decode() if re.fullmatch(rb"[\d.]+", x) else str(int.from_bytes(x, "little")) for x in found]
             of_version = f" of version {'.'.join(words)}" if words else ""
             raise UserError(f"{path}: {name or f'a {suffix} file'}{of_version}, which is not read: {advice}")
-    kind = _told_kind(TEXTS, text, suffix) or suffix
+    kind = _match_kind(TEXTS, text, suffix) or suffix
     if kind not in KNOWN:
         raise UserError(f"{path}: unknown kind of file {path.suffix!r}; expected {known}")
     return kind
 
 
-def _told_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suffix: str) -> str:
+def _match_kind(signs: Sequence[tuple[bytes, tuple[str, ...]]], head: bytes, suffix: str) -> str:
     """The kind of a file by its first bytes; empty if they do not tell."""
     kinds = next((kinds for sign, kinds in signs if re.match(sign, head)), ("",))
     return suffix if suffix in kinds else kinds[0]

@@ -52,14 +52,19 @@ MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names;
 COMMENTS = ("#", "//", "%")
 NUMBER = re.compile(r"[+-]?((\d+(\.\d*)?|\.\d+)([ed][+-]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
 # separators of thousands, if a semicolon separates the numbers, and if not; the last mark in 1.234,5 is the decimal one
-THOUSANDS = (re.compile(r"(?<=\d)(['’\ufffd\s](?=\d{3})|[.,](?=\d{3}[.,]))"), re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"))
+THOUSANDS = (
+    re.compile(r"(?<=\d)(['’\ufffd\s](?=\d{3})|\.(?=\d{3}(\.\d{3}){0,3},\d)|,(?=\d{3}(,\d{3}){0,3}\.\d))"),
+    re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"),
+)
 PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
 PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
+COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a missing number
 UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
-FORTRAN, WHOLE = re.compile(r"(?<=[\d.])d(?=[+-]?\d)", re.IGNORECASE), re.compile(r"\.0+(?![\d.ed])", re.IGNORECASE)
+FORTRAN = re.compile(r"(?<![#\w.])([+-]?(?:\d+(?:\.\d*)?|\.\d+))d(?=[+-]?\d)", re.IGNORECASE)  # exponents
+WHOLE = re.compile(r"(?<=\d)\.0+(?![\d.ed])", re.IGNORECASE)
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
 INDEX = "index"  # name of a column that is not used
 MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can declare any size
@@ -102,7 +107,9 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             if not names:
                 names = _names(before, table, path.suffix.lower(), report)
-                of_words = {i: "rgb" if PACKED.fullmatch(words[i]) else f"{names[i]} (words)" for i in unread}
+                of_words = {i: f"{names[i]} (words)" for i in unread}
+                hexadecimal = [i for i in unread if PACKED.fullmatch(words[i]) and COLORED.search(names[i])]
+                of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
                 names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
@@ -180,7 +187,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
-    texts = [FORTRAN.sub("e", WHOLE.sub("", UNDEFINED.sub("nan", text))) for text in texts]
+    texts = [FORTRAN.sub(r"\1e", WHOLE.sub("", UNDEFINED.sub("nan", text))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)
     for (number, text), plain in zip(rows, texts, strict=True):
@@ -234,7 +241,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
             "(then intensity, r g b, nx ny nz, roughness metallic), or a header line that names the columns"
         )
     steps = np.diff(table[:, 0].astype(np.float64)) if count > 3 and len(table) > 2 else np.zeros(1)
-    timed = steps.min() > 0 and steps.std() < steps.mean() / 2
+    timed = count in (4, 5, 7, 10) and steps.min() > 0 and steps.std() < steps.mean() / 2
     whole = (table % 1 == 0).all(axis=0)
     pictured = count > 7 and whole[[0, 1, 5, 6, 7]].all() and not whole[2:5].any()  # pixels: row and column first
     first = 2 if pictured else int(timed or np.all(steps == 1))
@@ -265,6 +272,7 @@ def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
         ]
     if names[3:4] == ["scalar"]:
         packed = count == 4 and whole[3] and OPAQUE[-1] < np.median(table[:, 3]) <= table[:, 3].max() < 2**24
+        packed = packed and bool((np.diff(table[:, 3]) < 0).any())  # sorted: numbers or times of the points
         names[3] = "rgb" if packed else "intensity"
     if count > 3:
         others = [f"; r g b may as well be columns {i + 1} to {i + 3}: name them in a first line" for i in close[:1]]

@@ -45,8 +45,8 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
     if texcoords is not None and images and all(image is not None for image in images):
         return _textured(useful(vertices), corners, sizes, texcoords, of_faces.get("texnumber"), images)
-    told = header.textures or any("texture" in name for name, *_ in header.elements)
-    if texcoords is not None or "texcoord" in lists or told:
+    textured = header.textures or any("texture" in name for name, *_ in header.elements)
+    if texcoords is not None or "texcoord" in lists or textured:
         loading.ignored.add("texture coordinates")
     return colored_part(vertices, corners, sizes, of_faces, loading)
 
@@ -92,7 +92,7 @@ def load_stl(path: Path, loading: Loading) -> list[Part]:
     announced = int.from_bytes(data[80:STL_HEAD], "little")
     whole = len(data) == STL_HEAD + STL_TRIANGLE.itemsize * announced  # then it is binary, whatever its first bytes
     if not whole and re.match(rb"(\xef\xbb\xbf)?\s*(solid|facet)\b[^\0]*?(facet|endsolid|vertex)", data, re.IGNORECASE):
-        rows = [row.decode("ascii", "replace") for row in re.findall(rb"(?i)\bvertex[ \t]+([^\r\n]*)", data)]
+        rows = re.findall(r"(?i)\bvertex[ \t]+([^\r\n]*)", data.decode("ascii", "replace"))
         corners = load_text([*enumerate(rows, 1)], "vertex", 3, ndmin=2) if rows else np.zeros((0, 3))
         if not re.search(rb"(?i)\bendsolid\b", data):
             loading.say("no line 'endsolid' ends the file: it may be cut off")

@@ -39,7 +39,7 @@ def register(kind: type) -> None:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
 def record(kind: type) -> Any:
-    """A frozen dataclass that is a pytree, and of which `jax.export` can write functions.
+    """A frozen dataclass that is a pytree, and whose functions `jax.export` can serialise.
 
     Its fields are not checked at run time: transformations rebuild records with leaves that are no arrays.
     """

@@ -314,8 +314,8 @@ def shade_window(
     frame = frame_camera(scene, camera, plan.doublings, plan.side)
     window = crop_camera(frame, window_buffer.corner, plan.width, plan.height)
     buffer = window_buffer.buffer
-    given = shader.compute_inputs(buffer, light, window)
-    layers = shade(params, given, buffer.depth, doublings=plan.doublings)
+    shader_inputs = shader.compute_inputs(buffer, light, window)
+    layers = shade(params, shader_inputs, buffer.depth, doublings=plan.doublings)
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     scale = 2**plan.doublings
     image, depth, acc = paste_window(layers, window_buffer.corner * scale, inside, plan.side, BEYOND * scale)
@@ -334,14 +334,16 @@ def rasterize(
 
 
 def shade(
-    params: dict | None, given: ShaderInputs, depth: Float[Array, "height width"], *, doublings: int
+    params: dict | None, shader_inputs: ShaderInputs, depth: Float[Array, "height width"], *, doublings: int
 ) -> Float[Array, "h w 5"]:
     """Colour times opacity, opacity, and depth along the camera's axis times opacity, at the doubled resolution."""
     if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in depth.shape), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(make_shader(params).apply({"params": params["params"]}, given.inputs[None], doublings))
-    color, alpha = compose_picture(outputs, given.maps[None], given.light_harmonics[None], doublings)
+        outputs = jnp.asarray(
+            make_shader(params).apply({"params": params["params"]}, shader_inputs.inputs[None], doublings)
+        )
+    color, alpha = compose_picture(outputs, shader_inputs.maps[None], shader_inputs.light_harmonics[None], doublings)
     known = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
     for _ in range(doublings):
         known = double_size(known)

@@ -36,6 +36,35 @@ def test_the_points_of_a_data_set_come_back_as_they_are_and_nothing_is_assumed(t
     assert lines == ["columns that are not used: face"]
 
 
+PLACES = spiral(60)
+ORDERED = np.column_stack([np.linspace(-1, 1, 60), PLACES[:, 1:]])  # x rises as a time would
+GREEN, DELTA = (0.02122, 0.40198, 0.04519), "\N{GREEK CAPITAL LETTER DELTA}"
+
+
+@pytest.mark.parametrize(
+    ("names", "places", "rest", "color"),
+    [
+        (f"x,y,z,{DELTA}x,{DELTA}y,{DELTA}z", PLACES, "9,8,7", None),
+        ("x,y,z,color,id", PLACES, "#28aa3c,0x00002a", GREEN),
+        ("x,y,z,id", PLACES, "0x00002a", None),
+        ("x,y,z,color,note", PLACES, "#28a1d2,n/a", (0.02122, 0.35640, 0.64448)),
+        ("", ORDERED, "0,0,1,40,170,60", GREEN),
+        ("", ORDERED, "40,170,60,0.25,0.75", GREEN),
+        ("x,y,z,a,b", PLACES, "nan(ind),.0", None),
+        ("", PLACES, "302400", None),
+    ],
+)
+def test_what_only_resembles_something_else_is_not_taken_for_it(tmp_path, names, places, rest, color):
+    rows = [",".join([*(f"{x:.6f}" for x in place), rest]) for place in places]
+    rows = [row.replace("302400", str(302400 + i)) for i, row in enumerate(rows)]  # seconds of a GPS week
+    path = tmp_path / "points.csv"
+    path.write_text("\n".join([names, *rows] if names else rows))
+    cloud, _ = read(path)
+    np.testing.assert_allclose(cloud.positions, places, atol=1e-5)
+    grey = cloud.base_color[:, :1]
+    np.testing.assert_allclose(cloud.base_color, np.broadcast_to(grey if color is None else color, (60, 3)), atol=1e-3)
+
+
 # Columns
 
 
