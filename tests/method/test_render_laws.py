@@ -117,9 +117,10 @@ def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(scenes,
     assert int(whole.overflow) == 0
     close(fitting, whole, rtol=1e-4, atol=1e-4)
     last = blend(*given, plan=exact._replace(entries=exact.entries - 1))
-    narrow = blend(*given, plan=exact._replace(slots=4, width=16))
+    narrow = blend(*given, plan=exact._replace(slots=4, width=24))
     assert 0 < int(last.overflow) < 100  # a disc
-    assert int(narrow.overflow) == 16 + np.sum(np.asarray(whole.buffer.opacity)[:, :16] > 0) - 4
+    fits = np.sum(np.asarray(whole.buffer.opacity)[:, :24] > 0)
+    assert int(narrow.overflow) == 8 + fits - 4 > 8
     check_finite((last, narrow))
 
 
