@@ -60,8 +60,9 @@ class Plan(NamedTuple):
     """Static sizes of a picture: hashable, made by `plan` or by hand.
 
     doublings: how often the network doubles the G-buffer's resolution.  side: 1, or 2 for supersampling: a pixel
-    averages side x side drawn ones.  width, height: the window, in pixels of the G-buffer.  entries, slots: capacities
-    for pairs of disc and pixel, and for covered pixels.
+    averages side x side drawn ones.  width, height: the window, in pixels of the G-buffer; of an object that fills the
+    picture, 2 BEYOND more than the picture has.  entries, slots: capacities for pairs of disc and pixel, and for
+    covered pixels.
     """
 
     doublings: int

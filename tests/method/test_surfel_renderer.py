@@ -72,7 +72,7 @@ def test_an_eye_close_to_a_floor_sees_none_of_it_above_the_horizon():
     floor = surfels(np.insert(across, 1, -0.1, axis=1), (0.0, 1, 0), 0.3, one_sided=np.zeros(len(across)))
     scene = SurfelScene(surfels=floor, spacing=jnp.float32(0.3), centre=jnp.zeros(3), scale=jnp.float32(1))
     view = camera(64, eye=(0, 0, 0), target=(0.0, 0, -1), field_of_view=np.pi / 2)
-    found = surfel_renderer.render(None, scene, view, LIGHT, plan=Plan(0, 1, 64, 64, 2**18, 4096))
+    found = surfel_renderer.render(None, scene, view, LIGHT, plan=Plan(0, 1, 96, 96, 2**18, 96**2))
     assert not found.acc[:30].any()
     assert found.acc[34:].min() > 0.9
 
