@@ -4,8 +4,8 @@
         a list `texcoord` per face, or s t or u v per vertex (MeshLab, OpenMVS)
 .stl    text: three lines `vertex x y z` per triangle; binary: 80 bytes, a count u32, 50 bytes per triangle; a count of
         0 means as many as fit
-.off    [[C][N]OFF], counts, vertices x y z [normal] [colour], in MeshLab's NCOFF the colour first, faces n i j k ...
-        [colour]; colours also without the C
+.off    `[[C][N]OFF]`, counts, vertices `x y z [normal] [colour]`, in MeshLab's NCOFF the colour first, faces
+        `n i j k ... [colour]`; colours also without the C
 """
 
 import io
