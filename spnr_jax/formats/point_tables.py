@@ -107,6 +107,8 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
             if not names:
                 names = _names(before, table, path.suffix.lower(), report)
+                if {names[i] for i in unread} & {*"xyz", *COLOR}:
+                    raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
                 of_words = {i: f"{names[i]} (words)" for i in unread}
                 hexadecimal = [i for i in unread if PACKED.fullmatch(words[i]) and COLORED.search(names[i])]
                 of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
