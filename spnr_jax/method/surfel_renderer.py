@@ -83,7 +83,7 @@ class Resolution(NamedTuple):
     side: int
 
 
-# --- scenes ---------------------------------------------------------------------------------------------------------
+# --- scenes -----------------------------------------------------------------------------------------------------------
 
 
 def encode(params: Any, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> SurfelScene:
@@ -189,10 +189,10 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 @CachedProgram
 def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Plan:
     """What a view needs, as arrays; the covered pixels are bounded by the rectangles around the discs."""
-    frame = frame_camera(scene, camera, doublings, side)
-    foot = splatting.project_discs(scene.surfels, frame)
+    wide = widen_camera(scene, camera, doublings, side)
+    foot = splatting.project_discs(scene.surfels, wide)
     _, width, height = place_window(foot)
-    slots = splatting.bound_covered_pixels(foot, frame)
+    slots = splatting.bound_covered_pixels(foot, wide)
     sizes: Any = width, height, splatting.count_entries(foot.covered), slots
     return Plan(doublings, side, *sizes)
 
@@ -213,7 +213,7 @@ def _round_count(count: int, least: int) -> int:
     return min(int(2 ** (np.ceil(2 * np.log2(max(count, least))) / 2)), most)
 
 
-def frame_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) -> Camera:
+def widen_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) -> Camera:
     """The camera in the box at the G-buffer's resolution, BEYOND pixels wider on each side.
 
     The doubled picture may exceed the image: it is cropped.
@@ -226,7 +226,7 @@ def frame_camera(scene: SurfelScene, camera: Camera, doublings: int, side: int) 
 
 
 def place_window(foot: Footprints) -> tuple[Int[Array, "2"], Int[Array, ""], Int[Array, ""]]:
-    """Corner (column, row), width and height of the window around the discs; it may reach beyond the frame."""
+    """Corner (column, row), width and height of the window around the discs; it may reach beyond the wide picture."""
     drawn, rows = foot.covered > 0, foot.covered // foot.width
     sides = []
     for first, size in ((foot.left, foot.width), (foot.top, rows)):
@@ -292,14 +292,14 @@ register(WindowBuffer)
 
 def rasterize_window(scene: SurfelScene, camera: Camera, light: Light, *, plan: Plan) -> WindowBuffer:
     """The first half of `render`: discs, with the light that they receive, blended to a G-buffer."""
-    frame = frame_camera(scene, camera, plan.doublings, plan.side)
-    foot = splatting.project_discs(scene.surfels, frame)
+    wide = widen_camera(scene, camera, plan.doublings, plan.side)
+    foot = splatting.project_discs(scene.surfels, wide)
     corner, width, height = place_window(foot)
     foot = splatting.move_to_window(foot, corner, plan.width, plan.height)
-    window = crop_camera(frame, corner, plan.width, plan.height)
+    window = crop_camera(wide, corner, plan.width, plan.height)
     buffer, overflow = rasterize(scene.surfels, foot, window, light, capacity=plan.entries, slots=plan.slots)
-    beyond = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
-    return WindowBuffer(buffer, corner, jnp.minimum(overflow, splatting.MOST_COUNTED) + beyond)
+    lacking = jnp.maximum(width - plan.width, 0) + jnp.maximum(height - plan.height, 0)
+    return WindowBuffer(buffer, corner, jnp.minimum(overflow, splatting.MOST_COUNTED) + lacking)
 
 
 def shade_window(
@@ -312,8 +312,8 @@ def shade_window(
     plan: Plan,
 ) -> Rendering:
     """The second half: the network over the G-buffer."""
-    frame = frame_camera(scene, camera, plan.doublings, plan.side)
-    window = crop_camera(frame, window_buffer.corner, plan.width, plan.height)
+    wide = widen_camera(scene, camera, plan.doublings, plan.side)
+    window = crop_camera(wide, window_buffer.corner, plan.width, plan.height)
     buffer = window_buffer.buffer
     shader_inputs = shader.compute_inputs(buffer, light, window)
     layers = shade(params, shader_inputs, buffer.depth, doublings=plan.doublings)

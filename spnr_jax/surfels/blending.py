@@ -51,9 +51,10 @@ def blend(
     narrow = jnp.concatenate([_gather_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
     opacity = jnp.sum(blend_weight, axis=0)
-    inverse = 1 / larger(opacity, LEAST_OPACITY)
+    divisor = larger(opacity, LEAST_OPACITY)
+    inverse = 1 / divisor
     means = _sum_rows(blend_weight, point, wide) * inverse[:, None]
-    mean_depth = jnp.sum(blend_weight * depth, axis=0) / larger(opacity, LEAST_OPACITY)
+    mean_depth = jnp.sum(blend_weight * depth, axis=0) / divisor
     squared = jnp.sum(blend_weight * (depth - mean_depth[None]) ** 2, axis=0)  # about the mean: else all digits cancel
     sharp = jnp.sum(sharp_weight, axis=0)
     has_color = sharp > LEAST_WEIGHT
