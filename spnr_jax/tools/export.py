@@ -296,8 +296,8 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
     ball = make_cloud(RADIUS * spiral(num_points), roughness=0.5)
     scene = surfel_method.encode_in_box(ball)
     plan = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
-    side = surfel_renderer.round_up(-(-size * plan.side // 2**plan.doublings) + surfel_renderer.MARGIN)
-    return plan._replace(width=side, height=side, entries=2 * plan.entries, slots=side * side)
+    window = surfel_renderer.widest_window(size, plan.doublings, plan.side)
+    return plan._replace(width=window, height=window, entries=2 * plan.entries, slots=window**2)
 
 
 def cloud_shapes(num_points: int) -> Arrays:

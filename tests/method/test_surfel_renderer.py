@@ -177,6 +177,16 @@ def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wo
         close(own.image, np.asarray(cut.image)[wider:-wider, wider:-wider], atol=most)
 
 
+@pytest.mark.parametrize("size", [31, 96, 160])
+def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scene, size):
+    for spacing, away in itertools.product((0.02, 0.1, 0.4), (0.9, 2.0, 3.0)):
+        other = scene.replace(spacing=jnp.float32(spacing))
+        plan = surfel_renderer.plan(other, camera(size, (0.0, 0.0, away)))
+        widest = surfel_renderer.widest_window(size, plan.doublings, plan.side)
+        assert max(plan.width, plan.height) <= widest
+        assert away > 1 or plan.doublings or plan.width == widest
+
+
 def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh):
     share = 0.75
     view = camera(64)
