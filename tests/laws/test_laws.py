@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import kernel_laws
 import numpy as np
+import paper_laws
 import pytest
 import surfel_laws
 from hypothesis import given
 from hypothesis import strategies as st
 from support.laws import Axis, Law, batch_law, close, extremes_law, hypotheses, in_both_precisions, points_law
 
-TABLE = (*surfel_laws.LAWS, *kernel_laws.LAWS)
+TABLE = (*surfel_laws.LAWS, *kernel_laws.LAWS, *paper_laws.LAWS)
 SWEEPS = [(law, axis) for law in TABLE for axis in law.axes if axis.low < axis.high]
 FULL = "STABILITY" in os.environ
 

@@ -1,5 +1,6 @@
 """Small mesh files, one writer a format: squares of a material, alone or beside an opaque one."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -89,3 +90,23 @@ def obj_leaf(folder: Path, statement: str, texels=None) -> Path:
     text = VERTICES + VERTICES.replace("v 0", "v 10").replace("v 1 ", "v 11 ") + TEXCOORDS
     text += "usemtl leaf\nf 1/1 2/2 3/3 4/4\nusemtl plain\nf 5/1 6/2 7/3 8/4\n"
     return write_obj(folder, text, f"newmtl leaf\n{statement}\nnewmtl plain\nKd 0 0 1\n")
+
+
+RGB, OBJ_FACE = ("red", "green", "blue"), "f 1 2 3 4\n"
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+CORNERS = [" ".join(map(str, corner)) for corner in SQUARE]
+
+
+def square_ply(kind: str, names, color, corners=SQUARE) -> str:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "".join(f"property {kind} {name}\n" for name in names)
+    rows = "".join(" ".join(map(str, (*corner, *color))) + "\n" for corner in corners)
+    faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    return head + faces + rows + "3 0 1 2\n3 0 2 3\n"
+
+
+def stl(count: int, tail: bytes = b"", at: np.ndarray = SQUARE[0]) -> bytes:
+    """A binary STL file of two triangles."""
+    triangles = [at + SQUARE[[0, 1, 2]], at + SQUARE[[0, 2, 3]]]
+    body = b"".join(np.append(np.zeros(3), corners).astype("<f4").tobytes() + b"\0\0" for corners in triangles)
+    return b"made by a scanner".ljust(80, b"\0") + struct.pack("<I", count) + body + tail

@@ -1,5 +1,6 @@
 """One table of points, and a writer of it for each format that holds points."""
 
+import io
 import itertools
 from typing import NamedTuple
 
@@ -24,6 +25,12 @@ WHOLE.levels[:2] = [[255, 5, 188], [0, 9, 64]]
 BROKEN = WHOLE._replace(positions=WHOLE.positions.copy())
 BROKEN.positions[[1, 3, 5], [0, 1, 2]] = np.nan, -np.inf, 1e39
 SOUND = np.delete(np.arange(12), [1, 3, 5])
+
+
+def as_npy(array: np.ndarray, pickled: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=pickled)
+    return stream.getvalue()
 
 
 PCD_FIELDS = [("x", "<f4"), ("y", "<f4"), ("pad", "u1", (3,)), ("z", "<f4"), ("rgb", "<f4"), ("roughness", "<f8")]
