@@ -11,13 +11,12 @@
 `place_cloud` also returns the transform back to the file's frame.  Point files may be larger than the memory.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from spnr_jax.config import Cut
 from spnr_jax.errors import UserError
@@ -36,14 +35,15 @@ from spnr_jax.formats.columns import (
     sound,
     useful,
 )
-from spnr_jax.formats.orientation import FARTHEST, ROTATIONS, find_up, holds_splats, sensor_of
+from spnr_jax.formats.orientation import ROTATIONS, find_up, holds_splats, sensor_of
+from spnr_jax.formats.plausibility import check_rounding, check_steps, check_values, without_no_data
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import SurfacePoints, bounding_box, sample_surface, vertex_points
 from spnr_jax.kernels import cloud_arrays, scenes
 from spnr_jax.kernels.cleaning import Clean, clean_columns
-from spnr_jax.kernels.cloud_arrays import inner_box, measure_spacing, stack_columns
+from spnr_jax.kernels.cloud_arrays import inner_box, stack_columns
 from spnr_jax.kernels.records import PointCloud
-from spnr_jax.surfels.normals import estimate_normals, face_sensor, outward_normals
+from spnr_jax.surfels.normals import face_sensor, outward_normals
 
 __all__ = ("MESHES", "PlacedCloud", "cloud_of_ply", "place_cloud", "read_cloud")
 
@@ -55,19 +55,7 @@ TEXT_MESHES = (".obj", ".off")  # numbers with any number of digits
 CUT_MESH = 2**18  # points sampled on a mesh before a part of it is cut out
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent: largest error of rounding to float32
-LOST_STEP = 1e-3  # of the extent of an axis: above it, the rounding of the file's numbers is reported
-MOST_LOST = 5e-3  # of the extent: above it rounding has destroyed the shape
-ROUNDED = 0.02  # of the extent: distance between values of an axis above which it may have been rounded
-SIX_DIGITS = 1e4  # distance from the origin, in extents of an axis: six digits leave at most a hundred values there
-NO_DATA = (-9999, -32767, -32768, -99999)  # heights that mean "unknown" in grids
-SAMPLE = 512  # points at which the file's normals are checked against the points
 FEWEST = 10  # points from which a surface can be estimated
-LEAST_POINTS = 100  # from which normals and missing colours can be checked
-OPPOSED = 0.15  # share of normals opposite to that of the nearest point, above which their signs mean nothing
-AGREEING = 0.6  # median cosine between given and estimated normals, below which the given ones are ignored
-PARALLEL = 0.9  # cosine to a constant normal, and the share of the points that must have it
-DEGREES, NEEDLE = 0.5, 100.0  # largest width in degrees; ratio of height to width above which degrees are suspected
-THIN = 0.1, 1.0  # thickness, in spacings, of a plate whose two sides cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,8 +149,8 @@ def _points_of(path: Path, kind: str, how: Reading) -> tuple[Points, float]:
         points, lines = Points(positions, values, points.origin), lines + done
     for line in lines:
         how.report(line)
-    if not sampled and len(points.positions) >= LEAST_POINTS:
-        _check_values(points, how.report)
+    if not sampled:
+        check_values(points.positions, points.values, how.report)
     return points, noise
 
 
@@ -252,11 +240,11 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
     """Points sampled on the surface of a mesh minus an origin (3,), which is 0 unless float32 is too coarse."""
     corners, report = np.stack(bounding_box(asset)), how.report
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
-    _check_rounding(vertices, report, of_mesh=True)
+    check_rounding(vertices, report, of_mesh=True)
     if kind not in TEXT_MESHES:
         # vertices are float64 here, whatever the file's type was
         short = vertices.astype(np.float32) if (vertices % 1).any() else vertices
-        _check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
+        check_steps(vertices, (short if (vertices == short).all() else vertices).T, report)
     if (origin := _find_origin(corners)).any():  # before anything is converted to float32
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     count = max(CUT_MESH if how.cut.is_given else 0, how.num_points or MESH_POINTS)
@@ -304,11 +292,11 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
     """Interprets the columns; equal and nearly equal points are merged, unless they were sampled on a mesh."""
     report = how.report
     if not sampled:
-        columns = _without_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
+        columns = without_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
     positions = stack_columns(columns)
     if not sampled:
-        _check_steps(positions, [columns[axis] for axis in "xyz"], report)
-        _check_rounding(positions, report)
+        check_steps(positions, [columns[axis] for axis in "xyz"], report)
+        check_rounding(positions, report)
     origin = _find_origin(positions)
     values, directions = materials(columns, report), normals(columns)
     if directions is not None:
@@ -324,93 +312,3 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
     if len(places) < FEWEST:
         report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)
-
-
-def _without_no_data(columns: Columns, report: Report) -> Columns:
-    """The points without those that mean "no data": many at 0 0 0 among others, or at a height of NO_DATA."""
-    positions = stack_columns(columns)
-    nowhere, low = np.asarray(~positions.any(axis=1)), np.isin(positions[:, 2], NO_DATA)
-    places, heights = positions[~nowhere], positions[~low, 2]
-    nowhere &= bool(nowhere.sum() > FEWEST and len(places) and np.ptp(places, axis=0).any())
-    low &= bool(len(heights) and heights.min() - NO_DATA[0] >= np.ptp(heights))
-    for what, mask in (("place is 0 0 0", nowhere), (f"height is {positions[:, 2].min():g}", low)):
-        if number := np.count_nonzero(mask):
-            report(f"{number:,} points left out: their {what}, no data")
-    kept = ~(nowhere | low)
-    return {name: column[kept] for name, column in columns.items()} if not kept.all() else columns
-
-
-def _check_rounding(positions: np.ndarray, report: Report, of_mesh: bool = False) -> None:
-    """Reports axes with few distinct values, far apart; of meshes, whose walls have few, only far from the origin."""
-    extent = float(np.ptp(positions, axis=0).max())
-    for axis, column in zip("xyz", positions.T, strict=True):
-        far, count = np.abs(column).max() > SIX_DIGITS * extent, len(np.unique(column))
-        apart = far if count == 1 else np.ptp(column) > ROUNDED * (count - 1) * extent and (far or not of_mesh)
-        if apart and count < len(column) / 10:
-            values = "value" if count == 1 else "values"
-            report(f"only {count} distinct {values} along {axis} of {len(column):,} points: is it rounded?")
-
-
-def _check_steps(positions: np.ndarray, columns: Iterable[np.ndarray], report: Report) -> None:
-    """Reports axes that the file rounds coarsely, and degrees; ValueError if rounding has destroyed the shape."""
-    low, high = inner_box(positions)
-    x, y, z = extent = high - low
-    farthest = np.maximum(np.abs(low), np.abs(high))
-    short = [column.dtype if column.dtype.kind == "f" and column.dtype.itemsize <= 4 else None for column in columns]
-    steps = np.array([np.spacing(kind.type(far)) if kind else 0.0 for kind, far in zip(short, farthest, strict=True)])
-    if extent.max() > FARTHEST:
-        raise UserError(f"holds points {extent.max():.2g} apart: a broken file, or one of another byte order")
-    if steps.max() > MOST_LOST * extent.max() > 0:
-        kind = short[int(steps.argmax())]
-        found = f"{steps.max():g} apart at best in {kind and kind.name}, for an extent of {extent.max():g}"
-        raise UserError(f"holds points {found}; move them to the origin")
-    for axis, step, width, far, column in zip("xyz", steps, extent, farthest, positions.T, strict=True):
-        fits = (column % 1).any() and (column == column.astype(np.float32)).all()  # text of numbers that were float32
-        step = step or fits * np.spacing(np.float32(far))
-        if step > LOST_STEP * width > 0:
-            report(f"only {len(np.unique(column))} distinct values along {axis}: the file's numbers are {step:g} apart")
-    on_earth = farthest[:2].min() <= 90 and farthest[:2].max() <= 180
-    if on_earth and 0 < max(x, y) < DEGREES and z > NEEDLE * max(x, y):
-        size = f"{max(x, y):.2g} wide and {z:.3g} high"
-        report(f"x and y look like degrees of longitude and latitude: {size}; project them to metres first")
-
-
-def _check_values(points: Points, report: Report) -> None:
-    """Fills in missing colours (black among others) and removes normals that contradict the points."""
-    positions, values, _ = points
-    tree, black = cKDTree(positions), np.asarray(~values["base_color"].any(axis=1))
-    if 0.1 < (share := black.mean()) < 0.9:
-        rows = np.flatnonzero(black)
-        near = tree.query(positions[rows[:: -(-len(rows) // SAMPLE)]], range(2, 10))[1]
-        if black[near].mean() < share + 0.25 * (1 - share):  # they lie among the others at random
-            of_all = f"{len(rows):,} of {len(black):,} points"
-            report(f"{of_all} have no colour (0 0 0): that of their neighbours is taken")
-            near = cKDTree(positions[~black]).query(positions[black], 3)[1]
-            values["base_color"] = values["base_color"].copy()
-            values["base_color"][black] = values["base_color"][~black][near].mean(axis=1)
-    thickness = np.ptp(positions @ np.linalg.eigh(np.cov(positions.T))[1][:, 0]) / max(measure_spacing(tree), 1e-300)
-    if THIN[0] < thickness < THIN[1]:
-        report(f"the points lie in a plate {thickness:.2g} spacings thick: if both sides were seen, their colours mix")
-    if "normals" in values and (reason := _doubt(positions, tree, values["normals"])):
-        report(f"normals of the file left out: {reason}")
-        del values["normals"]
-
-
-def _doubt(positions: np.ndarray, tree: cKDTree, normals: np.ndarray) -> str:
-    """Why normals (n, 3), 0 where unknown, cannot be those of the surface; empty if they can."""
-    known = np.flatnonzero(normals.any(axis=1))
-    if len(known) < LEAST_POINTS:
-        return ""
-    rows = known[:: -(-len(known) // SAMPLE)]
-    surface = estimate_normals(positions[rows], tree)
-    if np.abs(normals[rows] @ normals[rows[0]]).min() > 1 - 1e-6:
-        fits = float(np.mean(np.abs(surface @ normals[rows[0]]) > PARALLEL))
-        return "all are the same, and the points lie in no plane" if fits < PARALLEL else ""
-    cosine = float(np.median(np.abs(np.sum(surface * normals[rows], axis=1))))
-    if cosine < AGREEING:
-        return f"they lie across the surface of the points (cosine {cosine:.2f})"
-    beside = tree.query(positions[rows], [2])[1][:, 0]
-    opposed = np.sum(normals[rows] * normals[beside], axis=1) < 0
-    # the two sides of a thin wall face away from each other
-    outwards = np.sum((positions[rows] - positions[beside]) * (normals[rows] - normals[beside]), axis=1) > 0
-    return "those of neighbours have opposite signs" if np.mean(opposed & ~outwards) > OPPOSED else ""
