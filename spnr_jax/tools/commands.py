@@ -81,8 +81,8 @@ class CloudOptions:
     """A file of points or a mesh, how it is read, and the network and light that draw it."""
 
     cloud: tyro.conf.Positional[Path]
-    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf .obj
-    .stl .off (its surface is sampled)."""
+    """.ply .spz (also 3D Gaussian splats) .pcd .xyz .txt .csv .tsv .asc .pts .las .laz .npz .npy, or a mesh: .glb .gltf
+    .obj .stl .off (its surface is sampled)."""
     num_points: int = 16384
     """Points kept of a larger cloud, evenly spread, or sampled from a mesh; fewer work too."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
@@ -246,7 +246,7 @@ class Export:
     making: tyro.conf.OmitArgPrefixes[SplatOptions] = SplatOptions()
     """Options of --splats."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The upward axis of the file for --splats, which are written with y up."""
+    """The upward axis of the file, for --splats; these are written with y up (.spz) or y down (.ply), as is usual."""
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`, for --splats."""
     out: Path = Path("exported")

@@ -1,6 +1,7 @@
 """Exports: a cloud's object as splats or as a page for any browser, and the network itself.
 
-Splats have y up, the units of the cloud's file and, unless float32 is too coarse there, its origin.
+Splats have y up (.spz) or y down (.ply), the units of the cloud's file and, unless float32 is too coarse there, its
+origin.
 
 The default network is bytes that need JAX alone: `encode` and `render` as serialised StableHLO, weights included.
 
