@@ -53,7 +53,7 @@ class Method:
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
     encode: Function = lazy("spnr_jax.method.inference:encode_volume")
     """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
-    render: Function = lazy("spnr_jax.method.inference:draw_each")
+    render: Function = lazy("spnr_jax.method.inference:render_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
     prepare: Function = lazy("spnr_jax.training.batching:prepare")
     """(config, dataset, run, *, light) -> function (first step) -> iterator of batches.  ValueError if the data set
@@ -91,8 +91,8 @@ METHODS: dict[str, Method] = {
     "surfels": Method(
         config=SurfelConfig,
         init=lazy("spnr_jax.method.surfel_method:init"),
-        encode=lazy("spnr_jax.method.surfel_method:encode"),
-        render=lazy("spnr_jax.method.surfel_method:render"),
+        encode=lazy("spnr_jax.method.surfel_method:encode_volume"),
+        render=lazy("spnr_jax.method.surfel_method:render_each"),
         prepare=lazy("spnr_jax.training.gbuffers:prepare"),
         loss=lazy("spnr_jax.training.gbuffers:loss"),
         takes_light=True,
@@ -102,8 +102,8 @@ METHODS: dict[str, Method] = {
     "paper": Method(
         config=PaperConfig,
         network="spnr_jax.method.paper_method:PaperNetwork",
-        encode=lazy("spnr_jax.method.paper_method:encode"),
-        render=lazy("spnr_jax.method.paper_method:render"),
+        encode=lazy("spnr_jax.method.paper_method:encode_volume"),
+        render=lazy("spnr_jax.method.paper_method:render_each"),
         discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
         label="The paper's network",
     ),

@@ -2,7 +2,7 @@
 
     encode, render               batches of objects, in the box; pure
     loss                         loss of a training batch; pure
-    encode_volume, draw_each     one object, compiled: for the handle (model.py), scores and the viewer
+    encode_volume, render_each   one object, compiled: for the handle (model.py), scores and the viewer
 
 The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
 Values sown into the collection "losses" are added to the loss.
@@ -147,7 +147,7 @@ def encode_volume(
     return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
 
 
-def draw_each(
+def render_each(
     variables: dict,
     volume: Volume,
     views: Sequence[Camera],

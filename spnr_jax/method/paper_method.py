@@ -264,7 +264,7 @@ def union_weights(
 # --- the functions of the method --------------------------------------------------------------------------------------
 
 
-def encode(
+def encode_volume(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched), and how far from its points rays are sampled."""
@@ -273,7 +273,7 @@ def encode(
     return dataclasses.replace(volume, reach=reach)
 
 
-def render(
+def render_each(
     variables: dict,
     volume: Volume,
     views: Sequence[Camera],
@@ -284,7 +284,7 @@ def render(
 ) -> Iterator[Rendering]:
     """Views one after the other, with the number of samples of a quality level."""
     options = choose_options(config, quality, volume.reach)
-    return inference.draw_each(variables, volume, views, lights, config=config, options=options)
+    return inference.render_each(variables, volume, views, lights, config=config, options=options)
 
 
 def choose_options(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:

@@ -47,7 +47,7 @@ def init(key: Key, config: SurfelConfig) -> dict:
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, shader.NUM_FEATURES)), 1))
 
 
-def encode(
+def encode_volume(
     variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched); sparse clouds get learned points."""
@@ -84,7 +84,7 @@ def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALL
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 
-def render(
+def render_each(
     variables: dict | None,
     volume: Volume,
     views: Sequence[Camera],
