@@ -14,7 +14,6 @@ from flax import struct
 from jax import export
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
@@ -225,18 +224,6 @@ class Light:
         places = xp.arange(tables.shape[-2]) - whole.astype(int)
         near, far = (tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
-
-
-def check_camera_kind(camera: Any) -> None:
-    """ValueError unless it is a camera, or a batch of cameras in one record."""
-    check_kind(camera, Camera, "camera: expected a Camera, as of model.camera or cameras.pinhole")
-
-
-def check_light(light: Light | None) -> None:
-    """ValueError unless it is one light, or None."""
-    check_kind(light, Light | None, "light: expected a Light, as spnr_jax.read_light('studio') or light_of(map)")
-    if light is not None and np.shape(light.tables) != TABLES:
-        raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 
 
 @record
