@@ -118,8 +118,8 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
         camera = cameras.resize(
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
         )
-    resolution = surfel_renderer.choose_resolution(scene, camera, render_scale)
-    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, **resolution._asdict()))
+    doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
+    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
     return PlannedView(camera, light or room_light(), Plan(*map(int, needed)))
 
 

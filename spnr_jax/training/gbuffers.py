@@ -107,8 +107,8 @@ def loss(
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the picture on white and of the opacity, weighted as the config says."""
     assert isinstance(config.model, SurfelConfig)
-    network, params = Shader(config.model.widths, config.model.top), {"params": variables["params"]}
-    outputs: Any = network.apply(params, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
+    network = Shader(config.model.widths, config.model.top)
+    outputs: Any = network.apply(variables, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
     maps, light_harmonics = jnp.asarray(crops.maps), jnp.asarray(crops.light_harmonics)
     color, alpha = compose_picture(outputs, maps, light_harmonics, crops.doublings)
     image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
