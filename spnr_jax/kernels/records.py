@@ -95,16 +95,17 @@ class Rays:
 
 @record
 class Rendering:
-    """The result of a rendering: `image` after the upsampler, the rest at the resolution of the volume rendering.
+    """The result of a rendering; of a network with an upsampler, all but `image` has the resolution before it.
 
     `depth` is the expected distance along the ray (where nothing is hit: the far side of the box, or 0 beside it),
     `acc` the opacity.
     """
 
     image: Float[Array, "*batch height width 3"]
-    image_lr: Float[Array, "*batch height_lr width_lr 3"]
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
+    image_lr: Float[Array, "*batch height_lr width_lr 3"] | None = None
+    """The image before the upsampler; networks without one leave it out."""
     overflow: Int[Array, "*batch"] | None = None
     """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 

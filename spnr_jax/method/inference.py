@@ -121,13 +121,13 @@ def opacity_loss(
 def reconstruction_loss(
     config: TrainConfig,
     image: Float[Array, "*batch"],
-    image_lr: Float[Array, "*batch_lr"],
+    image_lr: Float[Array, "*batch_lr"] | None,
     reference: Array,
     mask: Array | None = None,
 ) -> Float[Array, ""]:
     """Weighted errors of the image, and of the low-resolution rendering against the downsampled reference."""
     error = pixel_error(config, image, reference, mask)
-    if config.model.upsamples:
+    if config.model.upsamples and image_lr is not None:
         low = losses.area_downsample(reference, image_lr.shape[-2])
         error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
     error = config.loss.l1_weight * error

@@ -136,9 +136,9 @@ _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 @jax.jit
 def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
-    """An empty view: the object is not visible."""
+    """An empty view: the object is not visible.  Compiling the network for an empty window would take long."""
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
     image, depth, acc = surfel_renderer.paste_window(*nothing, inside, 1, 0)
     overflow = jnp.zeros((), jnp.int32)
-    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=overflow)
+    return Rendering(image=image, depth=depth / scene.scale, acc=acc, overflow=overflow)

@@ -318,7 +318,7 @@ def shade_window(
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     scale = 2**plan.doublings
     image, depth, acc = paste_window(layers, window_buffer.corner * scale, inside, plan.side, BEYOND * scale)
-    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
+    return Rendering(image=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
 
 def rasterize(

@@ -115,7 +115,7 @@ def loss(
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
     reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]
-    value = reconstruction_loss(config, image, image, reference)
+    value = reconstruction_loss(config, image, None, reference)
     value += opacity_loss(config, alpha, opacity)
     squared = jnp.sum((image - reference) ** 2 * opacity[..., None])
     return value, Outcome(
