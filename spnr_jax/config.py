@@ -140,8 +140,6 @@ class NetworkConfig:
 
     method: ClassVar[str] = "none"
     """Name of the method, for files and tables."""
-    qualities: ClassVar[tuple[Quality, ...]] = ("best",)
-    """Quality levels at which its pictures differ, the best first."""
     has_discriminator: ClassVar[bool] = False
     """Whether its loss may be adversarial."""
     crops: ClassVar[bool] = False
@@ -174,7 +172,6 @@ class PaperConfig(NetworkConfig):
     """Sizes of the paper's network: encoder, sampling, field, upsampler."""
 
     method: ClassVar[str] = "paper"
-    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft", "trained")
     has_discriminator: ClassVar[bool] = True
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
@@ -227,7 +224,6 @@ class SurfelConfig(NetworkConfig):
     """Sizes of our surfel network (`method/surfel_method.py`)."""
 
     method: ClassVar[str] = "surfels"
-    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
     crops: ClassVar[bool] = True
 
     image_resolution: int = 512
