@@ -127,8 +127,8 @@ def make_trivial(name: str, factor: float = 1.0) -> Method:
 
     def show(item: data_sets.ObjectData) -> Pictures:
         if name == "white":
-            image = render_white(item.camera)
-            return Pictures(image=image, acc=jnp.zeros(image.shape[:-1]))
+            white = jnp.ones((*item.images.shape[:-1], 3))
+            return Pictures(image=white, acc=jnp.zeros(white.shape[:-1]))
         radius = jnp.float32(factor * measure_nearest_distance(item.cloud))
         image, acc = _draw_trivial(item.cloud, item.camera, radius, method=name)
         return Pictures(image=image, acc=acc)
@@ -268,11 +268,6 @@ def compare(
 
 
 # --- the trivial renderers --------------------------------------------------------------------------------------------
-
-
-def render_white(camera: Camera) -> Float[Array, "*batch height width 3"]:
-    """The white image."""
-    return jnp.ones((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3))
 
 
 def render_splat(
