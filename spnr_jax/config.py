@@ -257,10 +257,8 @@ class LossConfig:
     """Steps between R1 penalties; each is scaled by this number (lazy regularisation)."""
     discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
-    pixel: Literal["l1", "mse"] = "l1"
-    """Error per pixel; the weights named l1 apply to either."""
     masked: bool = False
-    """Exclude pixels of opacity 0 from the pixel error: Point-NeRF's rays without a point in reach."""
+    """Exclude pixels of opacity 0 from the errors of the image: Point-NeRF's rays without a point in reach."""
     opacity_l1_weight: float = 0.0
     """L1 between the opacity and the reference's."""
     opacity_weight: float = 0.0

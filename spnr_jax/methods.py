@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
+from spnr_jax.config import LossConfig, NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
 from spnr_jax.errors import UserError, first_line, require
 from spnr_jax.presets import PRESETS
 
@@ -110,8 +110,12 @@ METHODS: dict[str, Method] = {
 }
 
 
-# entries of files that are no fields of a config: one of earlier versions, and those that name a network's class
-EXTRA_FIELDS: dict[type, tuple[str, ...]] = {TrainConfig: ("trains",), NetworkConfig: ("method", "source")}
+# entries of files that are no fields of a config: those of earlier versions, and those that name a network's class
+EXTRA_FIELDS: dict[type, tuple[str, ...]] = {
+    TrainConfig: ("trains",),
+    LossConfig: ("pixel",),
+    NetworkConfig: ("method", "source"),
+}
 
 
 class UnknownMethod(UserError):

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
@@ -102,11 +102,10 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
-def pixel_error(config: TrainConfig, image: Array, reference: Array, mask: Array | None = None) -> Float[Array, ""]:
-    """Mean error over all pixels, or over those where `mask` is True (0 if there are none)."""
+def mean_error(error: Float[Array, "*batch 3"], mask: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
+    """Mean over all pixels, or over those where `mask` is True (0 if there are none)."""
     if mask is None:
-        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
-    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+        return jnp.mean(error)
     return jnp.sum(jnp.where(mask[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(mask), 1)
 
 
@@ -125,13 +124,15 @@ def reconstruction_loss(
     reference: Array,
     mask: Array | None = None,
 ) -> Float[Array, ""]:
-    """Weighted errors of the image, and of the low-resolution rendering against the downsampled reference."""
-    error = pixel_error(config, image, reference, mask)
+    """Weighted errors of the image, and L1 of the low-resolution rendering against the downsampled reference."""
+    error = mean_error(jnp.abs(image - reference), mask)
     if config.model.upsamples and image_lr is not None:
         low = losses.area_downsample(reference, image_lr.shape[-2])
-        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+        error = error + config.loss.low_resolution_weight * losses.l1(image_lr, low)
     error = config.loss.l1_weight * error
-    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
+    if config.loss.mse_weight:
+        error = error + config.loss.mse_weight * mean_error((image - reference) ** 2, mask)
+    return error
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
