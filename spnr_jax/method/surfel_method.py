@@ -48,11 +48,10 @@ def init(key: Key, config: SurfelConfig) -> dict:
 
 
 def encode_volume(
-    variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
+    variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched); sparse clouds get learned points."""
-    cloud = densify_sparse(variables, cloud)
-    scene = encode_in_box(cloud)
+    scene = encode_in_box(densify_sparse(variables, cloud))
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
 
@@ -71,13 +70,13 @@ def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScen
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), near)
 
 
-def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
+def densify_sparse(variables: dict, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
     """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier.
 
     Compiled once per padded size, which is `least` or more.
     """
     count = int(np.sum(cloud.mask))
-    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
+    if "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     real = symmetry.complete(cloud_arrays.strip(cloud))
     padded = cloud_arrays.pad(real, cloud_arrays.bucket(len(real.mask), least))
@@ -85,7 +84,7 @@ def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALL
 
 
 def render_each(
-    variables: dict | None,
+    variables: dict,
     volume: Volume,
     views: Sequence[Camera],
     lights: Sequence[Light | None],

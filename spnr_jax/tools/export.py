@@ -119,7 +119,6 @@ def _splats(ready: PreparedObject, options: Export | Share, note: Say) -> Gaussi
         degree=how.harmonics,
         most=how.most_splats,
         views=how.fitting_views,
-        resolution=surfaces.RESOLUTION,
         volume=ready.volume,
     )
     if (origin := ready.placed.origin).any():
