@@ -128,7 +128,10 @@ class Model:
 
     @property
     def params(self) -> dict:
-        """The weights, a pytree of arrays: the first argument of `spnr_jax.encode` and `spnr_jax.render`."""
+        """The variables: the first argument of `spnr_jax.encode` and `spnr_jax.render`.
+
+        The shader's weights are in `params["params"]`, as Flax has it, and the densifier's in `params["densifier"]`.
+        """
         return self.variables
 
 
