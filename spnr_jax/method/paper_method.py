@@ -36,7 +36,6 @@ from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsa
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples per ray in training
 REACH_QUERIES = 4096  # points at which the spacing is measured
 REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
-CELLS_PER_VOXEL = 1  # along an axis: cells of the path of a ray through the box
 RAY_BLOCK = 256  # rays near points that are rendered at once
 CPU_BLOCK = 64  # the same on a CPU outside of training: what a block reads stays in the first-level cache
 HIT_BLOCK = 2**14  # rays that are tested at once for whether they hit anything
@@ -200,7 +199,7 @@ def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects:
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
         return voxels.whole_path(near, far)
-    return voxels.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
+    return voxels.open_path(near_points, rays, near, far, near_points.shape[-1], objects)
 
 
 def _find_hits(
