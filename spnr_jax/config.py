@@ -92,9 +92,6 @@ class RenderOptions:
     """Rays rendered at once, which bounds the memory; None: a default that suits the network."""
 
 
-AS_TRAINED = RenderOptions()
-
-
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
     """Sizes of PointNet and 3D U-Net, which encode points to a volume (`nn/paper_layers.py`)."""

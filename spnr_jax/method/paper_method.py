@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
+from spnr_jax.config import PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
 from spnr_jax.kernels.imaging import WHITE, resize_bilinear
@@ -88,11 +88,12 @@ class PaperNetwork(nn.Module):
         return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
 
     def render(
-        self, scene: Scene, camera: Camera, options: RenderOptions = AS_TRAINED, key: Key | None = None
+        self, scene: Scene, camera: Camera, options: RenderOptions | None = None, key: Key | None = None
     ) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
+        options = options or RenderOptions()
         samples = options.sampling or self.config.sampling
-        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options, key))
+        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options.block, key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -139,22 +140,23 @@ class PaperNetwork(nn.Module):
 
 
 def render_rays(
-    module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, options: RenderOptions, key: Key | None
+    module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, block_size: int | None, key: Key | None
 ) -> RenderedRays:
     """Renders rays (objects, rays, ...).  A key jitters the samples; each ray folds in its own number.
 
-    The network is a bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from
-    `CompositedRays` to features; `config.num_features` is the number of features of a ray.
+    `block_size` rays are rendered at once; None: all, or a default if samples lie only near points.  The network is a
+    bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from `CompositedRays` to
+    features; `config.num_features` is the number of features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
     if module.is_initializing():
-        return _on_one_device(lambda: module, scene, rays, number, samples, options, key)
+        return _on_one_device(lambda: module, scene, rays, number, samples, block_size, key)
     network, variables = module.unbind()  # JAX transformations must not close over a bound module
 
     def render_own(whole, scene, own_rays):
         variables, key = whole
-        return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, options, key)
+        return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, block_size, key)
 
     return split_objects(render_own, (variables, key), scene, (rays, number))
 
@@ -165,7 +167,7 @@ def _on_one_device(
     rays: Rays,
     number: Int[Array, "objects rays"],
     samples: SamplingConfig,
-    options: RenderOptions,
+    block_size: int | None,
     key: Key | None,
 ) -> RenderedRays:
     """`render_rays` for the rays of one device; `make_network` binds the Linen module anew inside transformations."""
@@ -180,17 +182,16 @@ def _on_one_device(
         composited = march(field, _path(near_points, rays, objects), samples, keys)
         return RenderedRays(decode(composited), composited.depth, composited.acc)
 
-    size = options.block
-    if size is None and samples.reach:
-        size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
-    if size is None or make_network().is_initializing():  # then there are no weights yet that a block could read
+    if block_size is None and samples.reach:
+        block_size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
+    if block_size is None or make_network().is_initializing():  # then there are no weights yet that a block could read
         rendered = block(*inputs)
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         white = jnp.zeros((far.size, make_network().config.num_features)).at[:, :3].set(WHITE)
         missed = RenderedRays(white, far, jnp.zeros_like(far))
-        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, missed, size)
+        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, missed, block_size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rendered)
 
 
