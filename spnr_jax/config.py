@@ -92,9 +92,6 @@ class RenderOptions:
     """Rays rendered at once, which bounds the memory; None: a default that suits the network."""
 
 
-AS_TRAINED = RenderOptions()
-
-
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
     """Sizes of PointNet and 3D U-Net, which encode points to a volume (`nn/paper_layers.py`)."""
@@ -140,8 +137,6 @@ class NetworkConfig:
 
     method: ClassVar[str] = "none"
     """Name of the method, for files and tables."""
-    qualities: ClassVar[tuple[Quality, ...]] = ("best",)
-    """Quality levels at which its pictures differ, the best first."""
     has_discriminator: ClassVar[bool] = False
     """Whether its loss may be adversarial."""
     crops: ClassVar[bool] = False
@@ -174,7 +169,6 @@ class PaperConfig(NetworkConfig):
     """Sizes of the paper's network: encoder, sampling, field, upsampler."""
 
     method: ClassVar[str] = "paper"
-    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft", "trained")
     has_discriminator: ClassVar[bool] = True
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
@@ -227,7 +221,6 @@ class SurfelConfig(NetworkConfig):
     """Sizes of our surfel network (`method/surfel_method.py`)."""
 
     method: ClassVar[str] = "surfels"
-    qualities: ClassVar[tuple[Quality, ...]] = ("best", "balanced", "draft")
     crops: ClassVar[bool] = True
 
     image_resolution: int = 512
@@ -261,10 +254,8 @@ class LossConfig:
     """Steps between R1 penalties; each is scaled by this number (lazy regularisation)."""
     discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
-    pixel: Literal["l1", "mse"] = "l1"
-    """Error per pixel; the weights named l1 apply to either."""
     masked: bool = False
-    """Exclude pixels of opacity 0 from the pixel error: Point-NeRF's rays without a point in reach."""
+    """Exclude pixels of opacity 0 from the errors of the image: Point-NeRF's rays without a point in reach."""
     opacity_l1_weight: float = 0.0
     """L1 between the opacity and the reference's."""
     opacity_weight: float = 0.0

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spnr_jax.config import NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
+from spnr_jax.config import LossConfig, NetworkConfig, PaperConfig, SurfelConfig, TrainConfig, mismatch, types_of
 from spnr_jax.errors import UserError, first_line, require
 from spnr_jax.presets import PRESETS
 
@@ -53,7 +53,7 @@ class Method:
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
     encode: Function = lazy("spnr_jax.method.inference:encode_volume")
     """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
-    render: Function = lazy("spnr_jax.method.inference:draw_each")
+    render: Function = lazy("spnr_jax.method.inference:render_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
     prepare: Function = lazy("spnr_jax.training.batching:prepare")
     """(config, dataset, run, *, light) -> function (first step) -> iterator of batches.  ValueError if the data set
@@ -91,8 +91,8 @@ METHODS: dict[str, Method] = {
     "surfels": Method(
         config=SurfelConfig,
         init=lazy("spnr_jax.method.surfel_method:init"),
-        encode=lazy("spnr_jax.method.surfel_method:encode"),
-        render=lazy("spnr_jax.method.surfel_method:render"),
+        encode=lazy("spnr_jax.method.surfel_method:encode_volume"),
+        render=lazy("spnr_jax.method.surfel_method:render_each"),
         prepare=lazy("spnr_jax.training.gbuffers:prepare"),
         loss=lazy("spnr_jax.training.gbuffers:loss"),
         takes_light=True,
@@ -102,16 +102,20 @@ METHODS: dict[str, Method] = {
     "paper": Method(
         config=PaperConfig,
         network="spnr_jax.method.paper_method:PaperNetwork",
-        encode=lazy("spnr_jax.method.paper_method:encode"),
-        render=lazy("spnr_jax.method.paper_method:render"),
+        encode=lazy("spnr_jax.method.paper_method:encode_volume"),
+        render=lazy("spnr_jax.method.paper_method:render_each"),
         discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
         label="The paper's network",
     ),
 }
 
 
-# entries of files that are no fields of a config: one of earlier versions, and those that name a network's class
-EXTRA_FIELDS: dict[type, tuple[str, ...]] = {TrainConfig: ("trains",), NetworkConfig: ("method", "source")}
+# entries of files that are no fields of a config: those of earlier versions, and those that name a network's class
+EXTRA_FIELDS: dict[type, tuple[str, ...]] = {
+    TrainConfig: ("trains",),
+    LossConfig: ("pixel",),
+    NetworkConfig: ("method", "source"),
+}
 
 
 class UnknownMethod(UserError):

@@ -208,9 +208,7 @@ class NPBG(nn.Module):
         rays = cameras.camera_rays(camera)
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         seen = jnp.isfinite(distances[0])
-        return Rendering(
-            image=image, image_lr=image, depth=jnp.where(seen, distances[0], far), acc=seen.astype(image.dtype)
-        )
+        return Rendering(image=image, depth=jnp.where(seen, distances[0], far), acc=seen.astype(image.dtype))
 
     def rasters(
         self, cloud: PointCloud, camera: Camera, shrink: int

@@ -95,7 +95,7 @@ class PointNeRFConfig(NetworkConfig):
         return True
 
 
-MASKED = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse", masked=True)
+MASKED = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0, masked=True)
 
 
 def published_config(size: int) -> TrainConfig:

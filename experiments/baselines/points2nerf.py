@@ -85,7 +85,7 @@ class Points2NeRFConfig(NetworkConfig):
         return True
 
 
-SQUARES = LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse")
+SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
 
 
 def published_config(size: int) -> TrainConfig:

@@ -32,5 +32,4 @@ def as_images(
 ) -> Rendering:
     """Views from the rays of `cameras.view_rays`, by a method that renders every pixel of the image."""
     shape = (*camera.cam_to_world.shape[:-2], camera.height, camera.width)
-    image = rgb.reshape(*shape, 3)
-    return Rendering(image=image, image_lr=image, depth=depth.reshape(shape), acc=acc.reshape(shape))
+    return Rendering(image=rgb.reshape(*shape, 3), depth=depth.reshape(shape), acc=acc.reshape(shape))

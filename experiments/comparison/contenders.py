@@ -50,7 +50,7 @@ def of_network(training: TrainConfig, variables: dict) -> Method:
     return Method(draw=draw_with(show), has_opacity=training.model.method != "npbg")
 
 
-def draw_with(show: evaluation.Method) -> Callable[[Any, ObjectData], Pictures]:
+def draw_with(show: evaluation.Draw) -> Callable[[Any, ObjectData], Pictures]:
     """A method of the evaluation, which encodes nothing beforehand, as `Method.draw`."""
     return lambda _, item: show(item)
 

@@ -207,7 +207,7 @@ def score_objects(
     return Scored(scores=scores, shown=shown, seconds=seconds)
 
 
-def time_views(method: Method, seconds: list[float]) -> evaluation.Method:
+def time_views(method: Method, seconds: list[float]) -> evaluation.Draw:
     """The method, noting the seconds per view until the pictures lie on the host."""
 
     def measured(item: ObjectData) -> Pictures:

@@ -45,6 +45,10 @@ from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training.weights import load
 
 COLUMNS = ("psnr", "ssim", "flip", "iou")
+LEVELS: dict[str, tuple[Quality, ...]] = {  # method -> quality levels at which its pictures differ, the best first
+    "paper": ("best", "balanced", "draft", "trained"),
+    "surfels": ("best", "balanced", "draft"),
+}
 SHARES = (0.75, 0.5, 0.25)  # of the pixels along a side that are drawn; the picture is enlarged from there
 
 
@@ -60,7 +64,7 @@ class Setting(NamedTuple):
 
 def settings(config: NetworkConfig, counts: Sequence[int]) -> list[Setting]:
     """Every way to ask a network, its best level first; of all but the first number of points the levels alone."""
-    levels, (first, *others) = config.qualities, counts
+    levels, (first, *others) = LEVELS.get(config.method, ("best",)), counts
     ways = [Setting("level", level, first, level) for level in levels]
     if config.any_size:
         ways += [Setting("fewer pixels", f"best, {share:g} of the size", first, share=share) for share in SHARES]

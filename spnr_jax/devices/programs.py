@@ -44,11 +44,6 @@ def use_mesh(mesh: Mesh | None) -> AbstractContextManager:
     return nullcontext() if mesh is None else jax.set_mesh(mesh)
 
 
-def replicated_sharding(mesh: Mesh) -> NamedSharding:
-    """The sharding of arrays that every device holds whole."""
-    return NamedSharding(mesh, PartitionSpec())
-
-
 def check_divides(mesh: Mesh | None, batch_objects: int) -> None:
     """ValueError if the objects of a batch cannot be divided among the devices."""
     if mesh is not None and batch_objects % mesh.size:

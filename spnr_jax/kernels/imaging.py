@@ -79,4 +79,4 @@ def enlarge(rendering: Rendering, height: int, width: int) -> Rendering:
     """The rendering at a larger size: colours by cubic interpolation, depth and opacity by linear interpolation."""
     color = jnp.clip(jax.image.resize(rendering.image, (height, width, 3), "cubic"), 0, 1)
     depth, acc = (jax.image.resize(x, (height, width), "linear") for x in (rendering.depth, rendering.acc))
-    return dataclasses.replace(rendering, image=color, image_lr=color, depth=depth, acc=acc)
+    return dataclasses.replace(rendering, image=color, depth=depth, acc=acc)

@@ -14,7 +14,6 @@ from flax import struct
 from jax import export
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 
 AnyArray = jax.Array | np.ndarray
@@ -96,16 +95,17 @@ class Rays:
 
 @record
 class Rendering:
-    """The result of a rendering: `image` after the upsampler, the rest at the resolution of the volume rendering.
+    """The result of a rendering; of a network with an upsampler, all but `image` has the resolution before it.
 
     `depth` is the expected distance along the ray (where nothing is hit: the far side of the box, or 0 beside it),
     `acc` the opacity.
     """
 
     image: Float[Array, "*batch height width 3"]
-    image_lr: Float[Array, "*batch height_lr width_lr 3"]
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
+    image_lr: Float[Array, "*batch height_lr width_lr 3"] | None = None
+    """The image before the upsampler; networks without one leave it out."""
     overflow: Int[Array, "*batch"] | None = None
     """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 
@@ -225,18 +225,6 @@ class Light:
         places = xp.arange(tables.shape[-2]) - whole.astype(int)
         near, far = (tables[..., (places - i) % len(places), :] for i in (0, 1))
         return Light(tables=(1 - part) * near + part * far)
-
-
-def check_camera_kind(camera: Any) -> None:
-    """ValueError unless it is a camera, or a batch of cameras in one record."""
-    check_kind(camera, Camera, "camera: expected a Camera, as of model.camera or cameras.pinhole")
-
-
-def check_light(light: Light | None) -> None:
-    """ValueError unless it is one light, or None."""
-    check_kind(light, Light | None, "light: expected a Light, as spnr_jax.read_light('studio') or light_of(map)")
-    if light is not None and np.shape(light.tables) != TABLES:
-        raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 
 
 @record

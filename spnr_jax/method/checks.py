@@ -3,6 +3,8 @@
 Values are checked only outside of programs: traced arrays have none.
 """
 
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Int
@@ -10,15 +12,7 @@ from jaxtyping import Int
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.cloud_arrays import check_cloud
-from spnr_jax.kernels.records import (
-    AnyArray,
-    Camera,
-    Light,
-    PointCloud,
-    SurfelScene,
-    check_camera_kind,
-    check_light,
-)
+from spnr_jax.kernels.records import TABLES, AnyArray, Camera, Light, PointCloud, SurfelScene
 from spnr_jax.surfels.constants import NEIGHBORS
 
 
@@ -39,6 +33,18 @@ def check_neighbors(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], wh
 def check_scene(scene: SurfelScene, where: str) -> None:
     """ValueError unless it is a scene."""
     check_kind(scene, SurfelScene, f"{where}: expected a scene of spnr_jax.encode, or volume.scene")
+
+
+def check_camera_kind(camera: Any) -> None:
+    """ValueError unless it is a camera, or a batch of cameras in one record."""
+    check_kind(camera, Camera, "camera: expected a Camera, as of model.camera or cameras.pinhole")
+
+
+def check_light(light: Light | None) -> None:
+    """ValueError unless it is one light, or None."""
+    check_kind(light, Light | None, "light: expected a Light, as spnr_jax.read_light('studio') or light_of(map)")
+    if light is not None and np.shape(light.tables) != TABLES:
+        raise UserError(f"light.tables has the shape {np.shape(light.tables)}, not {TABLES}; use jax.vmap for more")
 
 
 def check_camera(camera: Camera, where: str) -> None:

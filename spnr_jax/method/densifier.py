@@ -47,12 +47,12 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
     return dataclasses.replace(dense, positions=jnp.concatenate([jnp.asarray(cloud.positions), learned]))
 
 
-def densify_in_box(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
-    """`densify` of a cloud in the box."""
+def densify_in_box(weights: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -> PointCloud:
+    """`densify` of a cloud in the box, by the densifier's own weights."""
     neighbors = jnp.asarray(neighbors)
     nodes, candidates = build_graph(cloud, neighbors)
     evenness = measure_evenness(cloud, neighbors)
-    learned = predict(params, nodes, neighbors, candidates)
+    learned = predict(weights, nodes, neighbors, candidates)
 
     def extend(column: AnyArray, more: Array | None = None) -> Array:
         values = jnp.asarray(column)

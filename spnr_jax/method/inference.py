@@ -2,7 +2,7 @@
 
     encode, render               batches of objects, in the box; pure
     loss                         loss of a training batch; pure
-    encode_volume, draw_each     one object, compiled: for the handle (model.py), scores and the viewer
+    encode_volume, render_each   one object, compiled: for the handle (model.py), scores and the viewer
 
 The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
 Values sown into the collection "losses" are added to the loss.
@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
@@ -102,11 +102,10 @@ def lattice(key: Key, batch: Batch, stride: int) -> Batch:
     return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
 
 
-def pixel_error(config: TrainConfig, image: Array, reference: Array, mask: Array | None = None) -> Float[Array, ""]:
-    """Mean error over all pixels, or over those where `mask` is True (0 if there are none)."""
+def mean_error(error: Float[Array, "*batch 3"], mask: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
+    """Mean over all pixels, or over those where `mask` is True (0 if there are none)."""
     if mask is None:
-        return {"l1": losses.l1, "mse": losses.mse}[config.loss.pixel](image, reference)
-    error = {"l1": jnp.abs, "mse": jnp.square}[config.loss.pixel](image - reference)
+        return jnp.mean(error)
     return jnp.sum(jnp.where(mask[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(mask), 1)
 
 
@@ -121,17 +120,19 @@ def opacity_loss(
 def reconstruction_loss(
     config: TrainConfig,
     image: Float[Array, "*batch"],
-    image_lr: Float[Array, "*batch_lr"],
+    image_lr: Float[Array, "*batch_lr"] | None,
     reference: Array,
     mask: Array | None = None,
 ) -> Float[Array, ""]:
-    """Weighted errors of the image, and of the low-resolution rendering against the downsampled reference."""
-    error = pixel_error(config, image, reference, mask)
-    if config.model.upsamples:
+    """Weighted errors of the image, and L1 of the low-resolution rendering against the downsampled reference."""
+    error = mean_error(jnp.abs(image - reference), mask)
+    if config.model.upsamples and image_lr is not None:
         low = losses.area_downsample(reference, image_lr.shape[-2])
-        error = error + config.loss.low_resolution_weight * pixel_error(config, image_lr, low)
+        error = error + config.loss.low_resolution_weight * losses.l1(image_lr, low)
     error = config.loss.l1_weight * error
-    return error + config.loss.mse_weight * losses.mse(image, reference) if config.loss.mse_weight else error
+    if config.loss.mse_weight:
+        error = error + config.loss.mse_weight * mean_error((image - reference) ** 2, mask)
+    return error
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -147,7 +148,7 @@ def encode_volume(
     return Volume(scene=scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
 
 
-def draw_each(
+def render_each(
     variables: dict,
     volume: Volume,
     views: Sequence[Camera],

@@ -20,17 +20,8 @@ import numpy as np
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import (
-    Camera,
-    Light,
-    PointCloud,
-    Rendering,
-    SurfelScene,
-    Volume,
-    check_camera_kind,
-    check_light,
-    unstack,
-)
+from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume, unstack
+from spnr_jax.method.checks import check_camera_kind, check_light
 from spnr_jax.methods import method_of
 
 COARSEST_STEP = 1e-3  # of float32 at a cloud's coordinates, relative to half its diagonal
@@ -137,7 +128,10 @@ class Model:
 
     @property
     def params(self) -> dict:
-        """The weights, a pytree of arrays: the first argument of `spnr_jax.encode` and `spnr_jax.render`."""
+        """The variables: the first argument of `spnr_jax.encode` and `spnr_jax.render`.
+
+        The shader's weights are in `params["params"]`, as Flax has it, and the densifier's in `params["densifier"]`.
+        """
         return self.variables
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.config import AS_TRAINED, PaperConfig, RenderOptions, SamplingConfig, TrainConfig
+from spnr_jax.config import PaperConfig, RenderOptions, SamplingConfig, TrainConfig
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
 from spnr_jax.kernels.imaging import WHITE, resize_bilinear
@@ -36,7 +36,6 @@ from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsa
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples per ray in training
 REACH_QUERIES = 4096  # points at which the spacing is measured
 REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
-CELLS_PER_VOXEL = 1  # along an axis: cells of the path of a ray through the box
 RAY_BLOCK = 256  # rays near points that are rendered at once
 CPU_BLOCK = 64  # the same on a CPU outside of training: what a block reads stays in the first-level cache
 HIT_BLOCK = 2**14  # rays that are tested at once for whether they hit anything
@@ -89,11 +88,12 @@ class PaperNetwork(nn.Module):
         return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
 
     def render(
-        self, scene: Scene, camera: Camera, options: RenderOptions = AS_TRAINED, key: Key | None = None
+        self, scene: Scene, camera: Camera, options: RenderOptions | None = None, key: Key | None = None
     ) -> Rendering:
         """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
+        options = options or RenderOptions()
         samples = options.sampling or self.config.sampling
-        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options, key))
+        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options.block, key))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -140,22 +140,23 @@ class PaperNetwork(nn.Module):
 
 
 def render_rays(
-    module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, options: RenderOptions, key: Key | None
+    module: Any, scene: Scene, rays: Rays, samples: SamplingConfig, block_size: int | None, key: Key | None
 ) -> RenderedRays:
     """Renders rays (objects, rays, ...).  A key jitters the samples; each ray folds in its own number.
 
-    The network is a bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from
-    `CompositedRays` to features; `config.num_features` is the number of features of a ray.
+    `block_size` rays are rendered at once; None: all, or a default if samples lie only near points.  The network is a
+    bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from `CompositedRays` to
+    features; `config.num_features` is the number of features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
     if module.is_initializing():
-        return _on_one_device(lambda: module, scene, rays, number, samples, options, key)
+        return _on_one_device(lambda: module, scene, rays, number, samples, block_size, key)
     network, variables = module.unbind()  # JAX transformations must not close over a bound module
 
     def render_own(whole, scene, own_rays):
         variables, key = whole
-        return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, options, key)
+        return _on_one_device(lambda: network.bind(variables), scene, *own_rays, samples, block_size, key)
 
     return split_objects(render_own, (variables, key), scene, (rays, number))
 
@@ -166,7 +167,7 @@ def _on_one_device(
     rays: Rays,
     number: Int[Array, "objects rays"],
     samples: SamplingConfig,
-    options: RenderOptions,
+    block_size: int | None,
     key: Key | None,
 ) -> RenderedRays:
     """`render_rays` for the rays of one device; `make_network` binds the Linen module anew inside transformations."""
@@ -181,17 +182,16 @@ def _on_one_device(
         composited = march(field, _path(near_points, rays, objects), samples, keys)
         return RenderedRays(decode(composited), composited.depth, composited.acc)
 
-    size = options.block
-    if size is None and samples.reach:
-        size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
-    if size is None or make_network().is_initializing():  # then there are no weights yet that a block could read
+    if block_size is None and samples.reach:
+        block_size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
+    if block_size is None or make_network().is_initializing():  # then there are no weights yet that a block could read
         rendered = block(*inputs)
     else:
         objects, _, rays = inputs
         _, far, _ = cameras.intersect_box(rays.origins, rays.directions)
         white = jnp.zeros((far.size, make_network().config.num_features)).at[:, :3].set(WHITE)
         missed = RenderedRays(white, far, jnp.zeros_like(far))
-        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, missed, size)
+        rendered = voxels.map_existing(block, _find_hits(near_points, rays, objects), inputs, missed, block_size)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rendered)
 
 
@@ -200,7 +200,7 @@ def _path(near_points: Bool[Array, "objects g g g"] | None, rays: Rays, objects:
     near, far, _ = cameras.intersect_box(rays.origins, rays.directions)
     if near_points is None:
         return voxels.whole_path(near, far)
-    return voxels.open_path(near_points, rays, near, far, CELLS_PER_VOXEL * near_points.shape[-1], objects)
+    return voxels.open_path(near_points, rays, near, far, near_points.shape[-1], objects)
 
 
 def _find_hits(
@@ -264,7 +264,7 @@ def union_weights(
 # --- the functions of the method --------------------------------------------------------------------------------------
 
 
-def encode(
+def encode_volume(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched), and how far from its points rays are sampled."""
@@ -273,7 +273,7 @@ def encode(
     return dataclasses.replace(volume, reach=reach)
 
 
-def render(
+def render_each(
     variables: dict,
     volume: Volume,
     views: Sequence[Camera],
@@ -284,7 +284,7 @@ def render(
 ) -> Iterator[Rendering]:
     """Views one after the other, with the number of samples of a quality level."""
     options = choose_options(config, quality, volume.reach)
-    return inference.draw_each(variables, volume, views, lights, config=config, options=options)
+    return inference.render_each(variables, volume, views, lights, config=config, options=options)
 
 
 def choose_options(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:

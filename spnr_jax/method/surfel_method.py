@@ -47,12 +47,11 @@ def init(key: Key, config: SurfelConfig) -> dict:
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, shader.NUM_FEATURES)), 1))
 
 
-def encode(
-    variables: dict | None, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
+def encode_volume(
+    variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched); sparse clouds get learned points."""
-    cloud = densify_sparse(variables, cloud)
-    scene = encode_in_box(cloud)
+    scene = encode_in_box(densify_sparse(variables, cloud))
     scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
     return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
 
@@ -71,21 +70,21 @@ def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScen
     return _encode(cloud_arrays.pad(jax.tree.map(lambda x: x[order], real), size), near)
 
 
-def densify_sparse(variables: dict | None, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
+def densify_sparse(variables: dict, cloud: PointCloud, least: int = SMALLEST_BUCKET) -> PointCloud:
     """A sparse cloud in the box (unbatched) with reflected and learned points, if the variables include a densifier.
 
     Compiled once per padded size, which is `least` or more.
     """
     count = int(np.sum(cloud.mask))
-    if variables is None or "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
+    if "densifier" not in variables or count > densifier.MOST_POINTS or cloud.learned is not None:
         return cloud
     real = symmetry.complete(cloud_arrays.strip(cloud))
     padded = cloud_arrays.pad(real, cloud_arrays.bucket(len(real.mask), least))
     return cloud_arrays.strip(_densify(variables["densifier"], padded, neighbors(padded)))
 
 
-def render(
-    variables: dict | None,
+def render_each(
+    variables: dict,
     volume: Volume,
     views: Sequence[Camera],
     lights: Sequence[Light | None],
@@ -118,8 +117,8 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
         camera = cameras.resize(
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
         )
-    resolution = surfel_renderer.choose_resolution(scene, camera, render_scale)
-    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, **resolution._asdict()))
+    doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
+    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
     return PlannedView(camera, light or room_light(), Plan(*map(int, needed)))
 
 
@@ -136,9 +135,9 @@ _enlarge = jax.jit(enlarge, static_argnums=(1, 2), compiler_options=QUICK)
 
 @jax.jit
 def _leave_empty(scene: SurfelScene, camera: Camera) -> Rendering:
-    """An empty view: the object is not visible."""
+    """An empty view: the object is not visible.  Compiling the network for an empty window would take long."""
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     nothing = jnp.zeros((1, 1, 5)), jnp.zeros(2, jnp.int32)
     image, depth, acc = surfel_renderer.paste_window(*nothing, inside, 1, 0)
     overflow = jnp.zeros((), jnp.int32)
-    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=overflow)
+    return Rendering(image=image, depth=depth / scene.scale, acc=acc, overflow=overflow)

@@ -76,13 +76,6 @@ class Plan(NamedTuple):
 register(Plan)
 
 
-class Resolution(NamedTuple):
-    """Resolution of the G-buffer: side / 2^doublings of the picture's (as in `Plan`)."""
-
-    doublings: int
-    side: int
-
-
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
@@ -168,12 +161,12 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     each = int(np.prod(batch[len(objects) :], dtype=int))
     scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
     pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
-    finest = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of.doublings, -of.side))
-    return merge_plans(jax.device_get([count_sizes(*pair, **finest._asdict()) for pair in pairs]))
+    doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
+    return merge_plans(jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs]))
 
 
-def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> Resolution:
-    """The resolution for the scene's spacing in pixels at its centre, which counts as not nearer than NEAREST.
+def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
+    """`doublings` and `side` of a plan, by the scene's spacing in pixels at its centre, not nearer than NEAREST.
 
     `render_scale` is the share of the pixels along a side of a picture that the camera draws; the picture as a whole
     determines the resolution.
@@ -183,7 +176,7 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
     pixels = float(scene.spacing) * float(np.asarray(camera.intrinsics)[0, 0]) / render_scale / max(distance, NEAREST)
     doublings = int(np.clip(np.floor(np.log2(max(pixels / COARSEST, 1e-9))) + 1, 0, MOST_DOUBLINGS))
     finest = FINEST_OF_SMALL if max(camera.height, camera.width) / render_scale <= SMALL else FINEST
-    return Resolution(doublings, 2 if pixels < finest else 1)
+    return doublings, 2 if pixels < finest else 1
 
 
 @CachedProgram
@@ -325,7 +318,7 @@ def shade_window(
     inside = cameras.move_into_box(camera, scene.centre, scene.scale)
     scale = 2**plan.doublings
     image, depth, acc = paste_window(layers, window_buffer.corner * scale, inside, plan.side, BEYOND * scale)
-    return Rendering(image=image, image_lr=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
+    return Rendering(image=image, depth=depth / scene.scale, acc=acc, overflow=window_buffer.overflow)
 
 
 def rasterize(
@@ -346,9 +339,7 @@ def shade(
     if params is None:
         outputs = jnp.zeros((1, *(n << doublings for n in depth.shape), NUM_OUTPUTS))
     else:
-        outputs = jnp.asarray(
-            make_shader(params).apply({"params": params["params"]}, shader_inputs.inputs[None], doublings)
-        )
+        outputs = jnp.asarray(make_shader(params).apply(params, shader_inputs.inputs[None], doublings))
     color, alpha = compose_picture(outputs, shader_inputs.maps[None], shader_inputs.light_harmonics[None], doublings)
     known = jnp.stack([depth, (depth > 0).astype(depth.dtype)], axis=-1)[None]
     for _ in range(doublings):

@@ -1,6 +1,6 @@
 """Scores of methods on a split of a data set: a network beside the trivial renderers that every table shows.
 
-A method is a function that draws the views of an object from its points (`Method`); all of them see the same points and
+A method is a function that draws the views of an object from its points (`Draw`); all of them see the same points and
 cameras, and are scored by the same metrics.
 
     white      an empty picture
@@ -55,7 +55,7 @@ class Pictures:
     depth: np.ndarray | Array | None = None
 
 
-Method = Callable[[data_sets.ObjectData], Pictures]
+Draw = Callable[[data_sets.ObjectData], Pictures]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +111,7 @@ def check_known_light(config: NetworkConfig, dataset: data_sets.Dataset) -> None
         dataset.check_lit_by_room()
 
 
-def make_method(variables: dict, config: TrainConfig) -> Method:
+def make_method(variables: dict, config: TrainConfig) -> Draw:
     """The method of a trained network; normals are removed from the clouds, because other methods get none."""
 
     def show(item: data_sets.ObjectData) -> Pictures:
@@ -122,13 +122,13 @@ def make_method(variables: dict, config: TrainConfig) -> Method:
     return show
 
 
-def make_trivial(name: str, factor: float = 1.0) -> Method:
+def make_trivial(name: str, factor: float = 1.0) -> Draw:
     """The method of a trivial renderer; the radius of its points is `factor` times their spacing."""
 
     def show(item: data_sets.ObjectData) -> Pictures:
         if name == "white":
-            image = render_white(item.camera)
-            return Pictures(image=image, acc=jnp.zeros(image.shape[:-1]))
+            white = jnp.ones((*item.images.shape[:-1], 3))
+            return Pictures(image=white, acc=jnp.zeros(white.shape[:-1]))
         radius = jnp.float32(factor * measure_nearest_distance(item.cloud))
         image, acc = _draw_trivial(item.cloud, item.camera, radius, method=name)
         return Pictures(image=image, acc=acc)
@@ -142,7 +142,7 @@ def _draw_trivial(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *
     return jax.vmap(lambda view: draw(cloud, view, radius))(camera)
 
 
-def evaluate_object(methods: dict[str, Method], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
+def evaluate_object(methods: dict[str, Draw], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
     """Pictures and scores of one object."""
     if not config.model.any_size:
         data_sets.check_resolution(item, config)
@@ -193,7 +193,7 @@ def median_view(psnr: np.ndarray) -> int:
 
 
 def score_methods(
-    methods: dict[str, Method],
+    methods: dict[str, Draw],
     config: TrainConfig,
     dataset: data_sets.Dataset,
     names: tuple[str, ...],
@@ -268,11 +268,6 @@ def compare(
 
 
 # --- the trivial renderers --------------------------------------------------------------------------------------------
-
-
-def render_white(camera: Camera) -> Float[Array, "*batch height width 3"]:
-    """The white image."""
-    return jnp.ones((*camera.cam_to_world.shape[:-2], camera.height, camera.width, 3))
 
 
 def render_splat(

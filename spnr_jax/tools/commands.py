@@ -13,7 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from spnr_jax import presets
-from spnr_jax.config import MOST_PIXELS, Cut, Schedule, TrainConfig
+from spnr_jax.config import MOST_PIXELS, Cut, Quality, Schedule, TrainConfig
 from spnr_jax.errors import UserError, require, require_at_least, require_within
 
 MOST_STOPS = 20
@@ -158,7 +158,7 @@ class Render(CloudOptions):
     """Degrees above the horizon."""
     resolution: int | None = None
     """Pixels along each side (default: 512 for surfels, else the size of the training)."""
-    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    quality: Quality = "best"
     """balanced: three quarters of the size, enlarged; draft: discs and light without the CNN.  The paper's network
     takes a quarter, half or all of its training samples per ray, near the points; trained: exactly as in training."""
     densify: bool = True
@@ -257,7 +257,7 @@ class Export:
     cloud (default: 16,384)."""
     resolution: int | None = None
     """Pixels along each side (default: the size of the training)."""
-    quality: Literal["draft", "balanced", "best", "trained"] = "best"
+    quality: Quality = "best"
     """As for `spnr render`."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
     """Target platforms."""

@@ -120,7 +120,6 @@ def _splats(ready: PreparedObject, options: Export | Share, note: Say) -> Gaussi
         degree=how.harmonics,
         most=how.most_splats,
         views=how.fitting_views,
-        resolution=surfaces.RESOLUTION,
         volume=ready.volume,
     )
     if (origin := ready.placed.origin).any():
@@ -200,7 +199,7 @@ def export_encode(model: Model, *, num_points: int = 1024, platforms: Sequence[s
     """
     _check_exportable(model)
     require(num_points >= 1, f"num_points must be at least 1, got {num_points}")
-    return _serialise(partial(encode, model.params), platforms, cloud_shapes(num_points))
+    return _serialise(partial(encode_arrays, model.params), platforms, cloud_shapes(num_points))
 
 
 def export_render(
@@ -224,8 +223,8 @@ def export_render(
     if quality == "balanced":
         raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
     params = None if quality == "draft" else model.params
-    draw = partial(render, params, size=size, plan=plan or make_plan(model, num_points, size))
-    volume = jax.eval_shape(partial(encode, model.params), cloud_shapes(num_points))
+    draw = partial(render_arrays, params, size=size, plan=plan or make_plan(model, num_points, size))
+    volume = jax.eval_shape(partial(encode_arrays, model.params), cloud_shapes(num_points))
     camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
     light = {"tables": _floats(7, lighting.HEIGHT, lighting.WIDTH, 3)}
     return _serialise(draw, platforms, volume, camera, light)
@@ -262,14 +261,16 @@ def _deserialise(content: bytes) -> export.Exported:
         raise UserError(f"not a function that JAX exported ({type(error).__name__}); export it again") from None
 
 
-def encode(params: dict, cloud: Arrays) -> Arrays:
+def encode_arrays(params: dict, cloud: Arrays) -> Arrays:
     """The scene of a cloud as a dict of arrays; pure."""
     points = PointCloud(**cloud)
     near = nearest(points.positions, points.mask)
     return dict(to_state_dict(surfel_renderer.encode(params, points, near)))
 
 
-def render(params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
+def render_arrays(
+    params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan
+) -> Arrays:
     """The picture of a scene as a dict of arrays; pure."""
     scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
     view = Camera(**camera, height=size, width=size)
@@ -302,7 +303,7 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
 
 
 def cloud_shapes(num_points: int) -> Arrays:
-    """Shapes of the arguments of `encode`."""
+    """Shapes of the arguments of `encode_arrays`."""
     vectors, scalars, mask = _floats(num_points, 3), _floats(num_points), jax.ShapeDtypeStruct((num_points,), np.bool_)
     return {"positions": vectors, "base_color": vectors, "roughness": scalars, "metallic": scalars, "mask": mask}
 

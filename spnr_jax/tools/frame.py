@@ -137,11 +137,8 @@ def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
 
 def read_view(wxyz: Any, position: Any, field_of_view: Any, width: Any, height: Any) -> View | None:
     """The view of a browser's message; None if it is invalid (NaN, no pixels, too far)."""
-    turn, place, canvas = (
-        read_numbers(wxyz, 4),
-        read_numbers(position, 3),
-        read_numbers([field_of_view, width, height], 3),
-    )
+    turn, place = read_numbers(wxyz, 4), read_numbers(position, 3)
+    canvas = read_numbers([field_of_view, width, height], 3)
     if turn is None or place is None or canvas is None:
         return None
     near = np.linalg.norm(turn) > 1e-6 and (np.abs(place) < FARTHEST_EYE).all()

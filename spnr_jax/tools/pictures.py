@@ -131,14 +131,13 @@ def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Cal
     """
     stills = list(ready.cameras) or [_camera(ready, FIRST_AZIMUTH + turn, options) for turn in _turns(options.views)]
     cameras, lights = list(stills), [ready.light] * len(stills)
-    if options.turntable != "none":
-        for turn in _turns(options.frames):
-            if options.turn == "light" and ready.light is not None:
-                cameras.append(_camera(ready, FIRST_AZIMUTH, options))
-                lights.append(ready.light.turned(turn))
-            else:
-                cameras.append(_camera(ready, turn, options))
-                lights.append(ready.light)
+    turns = _turns(0 if options.turntable == "none" else options.frames)
+    if options.turn == "light" and ready.light is not None:
+        cameras += [_camera(ready, FIRST_AZIMUTH, options)] * len(turns)
+        lights += [ready.light.turned(turn) for turn in turns]
+    else:
+        cameras += [_camera(ready, turn, options) for turn in turns]
+        lights += [ready.light] * len(turns)
     views = _draw(ready, cameras, lights, options)
     for i, (camera, rendering) in enumerate(zip(stills, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", rendering, camera, ready.volume, options)

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from tqdm import tqdm
 
-from spnr_jax.config import SurfelConfig, TrainConfig
+from spnr_jax.config import TrainConfig
 from spnr_jax.devices import programs
 from spnr_jax.errors import UserError
 from spnr_jax.formats.clouds import MOST_EVEN
@@ -44,7 +44,7 @@ from spnr_jax.method.inference import opacity_loss, reconstruction_loss
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.methods import Outcome
 from spnr_jax.nn import shader
-from spnr_jax.nn.shader import Shader, ShaderInputs, compose_picture
+from spnr_jax.nn.shader import ShaderInputs, compose_picture
 from spnr_jax.surfels import lighting, normals, splatting
 from spnr_jax.surfels.constants import CONSTANTS
 from spnr_jax.training.batching import read_ahead
@@ -106,16 +106,15 @@ def loss(
     variables: dict, crops: Crops, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the picture on white and of the opacity, weighted as the config says."""
-    assert isinstance(config.model, SurfelConfig)
-    network, params = Shader(config.model.widths, config.model.top), {"params": variables["params"]}
-    outputs: Any = network.apply(params, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
+    network = surfel_renderer.make_shader(variables)
+    outputs: Any = network.apply(variables, jnp.asarray(crops.inputs), crops.doublings, crops.margin)
     maps, light_harmonics = jnp.asarray(crops.maps), jnp.asarray(crops.light_harmonics)
     color, alpha = compose_picture(outputs, maps, light_harmonics, crops.doublings)
     image = color * alpha[..., None] + 1 - alpha[..., None]  # on white, as the reference is
     target = jnp.asarray(crops.target, jnp.float32) / 255
     opacity = target[..., 3]
     reference = target[..., :3] * opacity[..., None] + 1 - opacity[..., None]
-    value = reconstruction_loss(config, image, image, reference)
+    value = reconstruction_loss(config, image, None, reference)
     value += opacity_loss(config, alpha, opacity)
     squared = jnp.sum((image - reference) ** 2 * opacity[..., None])
     return value, Outcome(

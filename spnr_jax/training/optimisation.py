@@ -91,9 +91,9 @@ def create_state(config: TrainConfig, seed: int | Array | None = None) -> TrainS
 
 def init_from(state: TrainState, variables: dict) -> TrainState:
     """A fresh state with the generator's weights from another training; ValueError if they are of another network."""
-    params, stats = variables["params"], variables.get("batch_stats", {})
     needed = {"params": state.generator, "batch_stats": state.batch_stats}
-    own, other = (flatten_dict(weights, sep="/") for weights in (needed, {"params": params, "batch_stats": stats}))
+    given = {"params": variables["params"], "batch_stats": variables.get("batch_stats", {})}
+    own, other = (flatten_dict(weights, sep="/") for weights in (needed, given))
     for name in own | other:
         shapes = [weights[name].shape if name in weights else "none" for weights in (own, other)]
         if shapes[0] != shapes[1]:
@@ -102,15 +102,14 @@ def init_from(state: TrainState, variables: dict) -> TrainState:
                 "use the preset that they were trained with"
             )
 
-    def placed(new, old):
-        return jax.tree.map(lambda x, like: jax.device_put(jnp.array(x), like.sharding), new, old)
-
+    given = jax.tree.map(lambda x, like: jax.device_put(jnp.array(x), like.sharding), given, needed)
+    averaged = jax.tree.map(jnp.copy, given)
     return dataclasses.replace(
         state,
-        generator=placed(params, state.generator),
-        batch_stats=placed(stats, state.batch_stats),
-        averaged=placed(params, state.averaged),
-        averaged_stats=placed(stats, state.averaged_stats),
+        generator=given["params"],
+        batch_stats=given["batch_stats"],
+        averaged=averaged["params"],
+        averaged_stats=averaged["batch_stats"],
     )
 
 

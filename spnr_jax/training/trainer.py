@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from spnr_jax.config import Schedule, TrainConfig
@@ -115,7 +115,7 @@ def take_step(
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
     """The state to continue from (the newest checkpoint, or before the first step), and a message about it."""
     with programs.use_mesh(mesh):
-        sharding = None if mesh is None else programs.replicated_sharding(mesh)
+        sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec())  # every device holds it whole
         state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
     if (step := int(state.step)) >= config.num_steps:
         tqdm.write(f"{run} is finished: {step} steps")

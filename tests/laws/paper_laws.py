@@ -10,7 +10,7 @@ from kernel_laws import FINITE, each, seeds, sizes, towards_box, usual
 from support import reference
 from support.laws import TINY, Axis, Extremes, Law, close, extremes, sorted_distances
 
-from spnr_jax.config import AS_TRAINED, PaperConfig, SamplingConfig
+from spnr_jax.config import PaperConfig, SamplingConfig
 from spnr_jax.kernels import compositing, sampling, voxels
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference, paper_method
@@ -250,7 +250,7 @@ def render(volume, origins, directions, bias):
     )
     module, rays = inference.network(config), Rays(origins=origins, directions=directions)
     encoded, rng = Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool)), np.random.default_rng(7)
-    traced = partial(paper_method.render_rays, samples=config.sampling, options=AS_TRAINED, key=None)
+    traced = partial(paper_method.render_rays, samples=config.sampling, block_size=None, key=None)
     shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), encoded, rays, method=traced))
 
     def draw(x):

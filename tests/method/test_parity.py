@@ -10,7 +10,6 @@ import pytest
 from support import twin
 
 from experiments.speed.bench import make_batch
-from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels import cameras, compositing, losses, sampling, voxels
 from spnr_jax.method import inference
 from spnr_jax.method.paper_method import render_rays
@@ -55,7 +54,7 @@ def stages():
         positions = rays.origins[..., None, :] + coarse[..., None] * rays.directions[..., None, :]
         density, (rgb, _) = module.make_field(scene, rays, objects)[0](coarse)
         weights, _ = compositing.volume_weights(density, compositing.interval_lengths(coarse, far))
-        features, depth, acc = render_rays(module, scene, rays, counts, AS_TRAINED, None)
+        features, depth, acc = render_rays(module, scene, rays, counts, None, None)
         cell, offset = voxels.locate(cloud.positions, resolution)
         grid, occupancy = voxels.scatter_mean(cloud.positions, point_features, cloud.mask, resolution)
         rendering = module.render(scene, camera)

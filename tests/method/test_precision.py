@@ -11,7 +11,6 @@ from support.laws import numbers
 from support.tiny_model import MODEL, camera, cloud
 from support.tiny_training import BATCH, CONFIG
 
-from spnr_jax.config import AS_TRAINED
 from spnr_jax.kernels.records import Rays, Scene
 from spnr_jax.method import inference
 from spnr_jax.method.paper_method import render_rays
@@ -60,7 +59,7 @@ def test_points_field_sampling_and_compositing_stay_float32():
 
     def samples(variables, key):
         module = inference.network(BF16_MODEL).bind(variables)
-        return render_rays(module, scene, rays, BF16_MODEL.sampling, AS_TRAINED, key)
+        return render_rays(module, scene, rays, BF16_MODEL.sampling, None, key)
 
     def points(variables):
         module = inference.network(BF16_MODEL).bind(variables)

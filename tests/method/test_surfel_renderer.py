@@ -28,7 +28,7 @@ def render(variables, scene, view, quality="best"):
     """As the handle draws it, without its network for None."""
     volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     quality = "draft" if variables is None else quality
-    return next(surfel_method.render(variables or {}, volume, [view], [LIGHT], config=CONFIG, quality=quality))
+    return next(surfel_method.render_each(variables or {}, volume, [view], [LIGHT], config=CONFIG, quality=quality))
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ POINT_NERF = PointNeRFConfig(
 )
 BASELINE = dataclasses.replace(
     tiny_dataset.CONFIG,
-    loss=LossConfig(l1_weight=1.0, adversarial_weight=0.0, pixel="mse"),
+    loss=LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0),
     optimizer=OptimizerConfig(lr_generator=1e-2, warmup_steps=2, ema_decay=0.9),
 )
 RASTERS = NPBGConfig(encoder_widths=(8, 9, 10), decoder_widths=(5, 4), image_resolution=16)

@@ -69,7 +69,7 @@ class Painting(nn.Module):
 PAINTING = dataclasses.replace(
     L1_ONLY,
     model=PaintingConfig(image_resolution=SIZE),
-    loss=LossConfig(l1_weight=2.0, adversarial_weight=0.0, pixel="mse"),
+    loss=LossConfig(l1_weight=0.0, mse_weight=2.0, adversarial_weight=0.0),
 )
 JUDGED = dataclasses.replace(
     PAINTING,
@@ -201,15 +201,15 @@ class TestAverage:
         same_bits(optimisation.averaged_variables(state), evaluated)
 
 
-class TestPixelError:
-    def test_is_the_mean_of_what_the_config_asks_for(self):
-        image, reference = numbers(0, 2, 1, 4, 4, 3), numbers(1, 2, 1, 4, 4, 3)
-        for pixel, expected in (("l1", np.abs(image - reference)), ("mse", (image - reference) ** 2)):
-            config = dataclasses.replace(L1_ONLY, loss=dataclasses.replace(L1_ONLY.loss, pixel=pixel))
-            close(inference.pixel_error(config, image, reference), expected.mean())
-            seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
-            close(inference.pixel_error(config, image, reference, seen), expected[np.asarray(seen)].mean())
-            assert inference.pixel_error(config, image, reference, jnp.zeros_like(seen)) == 0
+def test_the_error_of_an_image_is_the_mean_that_the_weights_ask_for_over_all_pixels_or_the_given_ones():
+    image, reference = numbers(0, 2, 1, 4, 4, 3), numbers(1, 2, 1, 4, 4, 3)
+    seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
+    for weight, expected in (("l1_weight", np.abs(image - reference)), ("mse_weight", (image - reference) ** 2)):
+        loss = dataclasses.replace(L1_ONLY.loss, **{"l1_weight": 0.0, "low_resolution_weight": 0.0, weight: 1.0})
+        error_of = partial(inference.reconstruction_loss, dataclasses.replace(L1_ONLY, loss=loss), image, None)
+        close(error_of(reference), expected.mean())
+        close(error_of(reference, seen), expected[np.asarray(seen)].mean())
+        assert error_of(reference, jnp.zeros_like(seen)) == 0
 
 
 def test_every_step_draws_new_samples(fresh_l1):
