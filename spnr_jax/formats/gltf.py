@@ -8,7 +8,7 @@ reference converter.  A material has the texture coordinates of its first textur
 replaced by its mean.  Features that are not modelled are listed in `ignored`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -40,8 +40,11 @@ MATERIALS = "KHR_materials_"  # prefix; the ones that are not modelled are liste
 MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}, ("JOINTS_", "WEIGHTS_")
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
-RGB = slice(3)  # channels of texels
-DIRECTIONS = (2 * (np.arange(256) / 255) - 1).astype(np.float32)  # components by the texels of a normal map
+RGB = (0, 1, 2)  # channels of texels
+# values (256,) of encoded texels; those of a normal map are components of directions
+CURVES: dict[str, np.ndarray] = {
+    **{"linear": LEVELS, "sRGB": SRGB_TABLE, "direction": (2 * (np.arange(256) / 255) - 1).astype(np.float32)},
+}
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 # texels instead of a missing image: grey 0.5; roughness 0.5, metallic 0; specular 0.04, glossiness 0.5; flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
@@ -65,7 +68,7 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     ignored |= {"animations"} & document.keys()
     others = {*document.get("extensionsUsed", [])} - READ - HARMLESS
     ignored |= {name for name in others if not name.startswith(MATERIALS)}
-    read_look = cache(partial(read_material, file))
+    read_look = cache(partial(read_material, file, cache(partial(_read_image, file))))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id of the primitive, which the document keeps alive
     parts, repeated = [], 0
     for primitive, matrix, joints in drawn:
@@ -244,28 +247,41 @@ class Placement(NamedTuple):
     offset: tuple = (0.0, 0.0)
 
 
-def _read_texture(
-    file: GltfFile, places: list[Placement], info: dict | None, stand_in: tuple[int, ...]
-) -> np.ndarray | None:
-    """Encoded texels (h, w, 4) of a textureInfo, or `stand_in` (4,) for a missing image.
+class Texels:
+    """Encoded texels (h, w, 4); their values are computed once for all materials that show them."""
 
-    Its placement is appended to the material's `places`; if that differs from the first, the texture's mean (1, 1, 4)
-    is returned.
+    def __init__(self, encoded: np.ndarray):
+        self.encoded, self.values = encoded, cache(self._values)
+
+    def _values(self, channels: int | tuple[int, ...], curve: str) -> np.ndarray:
+        return decode_texels(self.encoded[..., channels], CURVES[curve])
+
+
+def _read_texture(
+    file: GltfFile,
+    read_image: Callable[[int], Texels | None],
+    places: list[Placement],
+    info: dict | None,
+    stand_in: tuple[int, ...],
+) -> Texels | None:
+    """Texels of a textureInfo, or `stand_in` (4,) for a missing image.
+
+    Its placement is appended to the material's `places`; if that differs from the first, the texture's mean is
+    returned.
     """
     if info is None:
         return None
-    texture = file.document["textures"][info["index"]]
-    texels = _read_image(file, texture)
-    texels = np.array(stand_in, np.uint8).reshape(1, 1, 4) if texels is None else texels
-    places.append(_placement(file, info, texture))
+    texels = read_image(info["index"]) or Texels(np.array(stand_in, np.uint8).reshape(1, 1, 4))
+    places.append(_placement(file, info))
     if places[-1] == places[0]:
         return texels
     file.loading.ignored.add("second texture with its own coordinates (its mean is used)")
-    return texels.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8)
+    return Texels(texels.encoded.mean(axis=(0, 1), keepdims=True).round().astype(np.uint8))
 
 
-def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
-    """Texels (h, w, 4) of a texture; None if its image is missing."""
+def _read_image(file: GltfFile, index: int) -> Texels | None:
+    """Texels of texture `index`; None if its image is missing."""
+    texture = file.document["textures"][index]
     extensions = texture.get("extensions", {})
     webp, basis = (extensions.get(name, {}).get("source") for name in (WEBP, BASIS))
     source = next((number for number in (webp, texture.get("source"), basis) if number is not None), None)
@@ -274,12 +290,15 @@ def _read_image(file: GltfFile, texture: dict) -> np.ndarray | None:
         return None
     image = file.document["images"][source]
     if "uri" in image:
-        return file.loading.read_image(image["uri"])
-    return file.loading.decode_image(bytes(file.view(image["bufferView"])), f"image {source}")
+        encoded = file.loading.read_image(image["uri"])
+    else:
+        encoded = file.loading.decode_image(bytes(file.view(image["bufferView"])), f"image {source}")
+    return None if encoded is None else Texels(encoded)
 
 
-def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement:
+def _placement(file: GltfFile, info: dict[str, Any]) -> Placement:
     """The placement of a texture; rotations are counter-clockwise with v downwards (KHR_texture_transform)."""
+    texture = file.document["textures"][info["index"]]
     sampler = file.document["samplers"][texture["sampler"]] if "sampler" in texture else {}
     wrap, wrap_t = (WRAPS[sampler.get(axis, 10497)] for axis in ("wrapS", "wrapT"))
     if wrap != wrap_t:
@@ -294,10 +313,13 @@ def _placement(file: GltfFile, info: dict[str, Any], texture: dict) -> Placement
     return Placement(wrap, number, tuple(map(tuple, turn.tolist())), (float(x), float(y)))
 
 
-def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
+def read_material(
+    file: GltfFile, read_image: Callable[[int], Texels | None], index: int | None
+) -> tuple[Material | None, Placement]:
     """Material `index` of a file (None if it is invisible everywhere) and the placement of its textures.
 
-    Index None: glTF's default, a rough metal, for references; for a picture, a white dielectric.
+    `read_image` gives the texels of a texture.  Index None: glTF's default, a rough metal, for references; for a
+    picture, a white dielectric.
     """
     loading, spec = file.loading, {} if index is None else file.document["materials"][index]
     if index is None and not loading.strict:
@@ -305,18 +327,18 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
         loading.say("parts without a material: roughness 0.5 and metallic 0 taken")
     name, extensions = str(spec.get("name", f"number {index}")), spec.get("extensions", {})
     places: list[Placement] = []
-    read = partial(_read_texture, file, places)
+    read = partial(_read_texture, file, read_image, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
     look, of_color = (spec.get("pbrMetallicRoughness", {}), "baseColor") if glossy is None else (glossy, "diffuse")
     color, factor = read(look.get(f"{of_color}Texture"), GREY), look.get(f"{of_color}Factor", (1, 1, 1, 1))
-    base_color = _scaled(color, RGB, factor[:3], SRGB_TABLE)
+    base_color = _scaled(color, RGB, factor[:3], "sRGB")
     if glossy is None:
         surface = read(look.get("metallicRoughnessTexture"), DULL)
         metallic = _scaled(surface, 2, look.get("metallicFactor", 1.0))
         roughness = _scaled(surface, 1, look.get("roughnessFactor", 1.0))
     else:
         surface = read(look.get("specularGlossinessTexture"), GLOSS)
-        specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), SRGB_TABLE)
+        specular = _scaled(surface, RGB, look.get("specularFactor", (1, 1, 1)), "sRGB")
         base_color, metallic = metallic_roughness(base_color, specular)
         roughness = 1 - _scaled(surface, 3, look.get("glossinessFactor", 1.0))
     # after the textures, because a missing file is the clearer error
@@ -331,15 +353,18 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
         loading.ignored |= spec.keys() & {"normalTexture"}
     elif (bumps := read(spec.get("normalTexture"), FLAT)) is not None and shown is not None:
         scale = float(spec["normalTexture"].get("scale", 1.0))
-        shown = replace(shown, normal_map=_scaled(bumps, RGB, np.array([scale, scale, 1], np.float32), DIRECTIONS))
+        shown = replace(shown, normal_map=_scaled(bumps, RGB, np.array([scale, scale, 1], np.float32), "direction"))
     placement = [*places, Placement()][0]
     return shown and replace(shown, wrap=placement.wrap), placement
 
 
-def _scaled(texels: np.ndarray | None, channels: int | slice, factor: Any, table: np.ndarray = LEVELS) -> np.ndarray:
-    """The factor, times channels of texels (h, w, 4), if any, looked up in a table (256,)."""
+def _scaled(texels: Texels | None, channels: int | tuple[int, ...], factor: Any, curve: str = "linear") -> np.ndarray:
+    """The factor, times the values of channels of texels, if any."""
     factor = np.asarray(factor) if isinstance(factor, np.ndarray) else np.asarray(factor, np.float64)
-    return factor if texels is None or not factor.any() else decode_texels(texels[..., channels], table) * factor
+    if texels is None or not factor.any():
+        return factor
+    values = texels.values(channels, curve)
+    return values if (factor == 1).all() else values * factor
 
 
 def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -359,7 +384,7 @@ def metallic_roughness(diffuse: np.ndarray, specular: np.ndarray) -> tuple[np.nd
     return np.clip(base_color, 0, 1), metallic[..., 0]
 
 
-def _alpha(spec: dict, color: np.ndarray | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:
+def _alpha(spec: dict, color: Texels | None, factor: float | int) -> tuple[str, np.ndarray, float | None]:
     """The statement that makes a material transparent ("": opaque), its alpha () or (h, w), and a mask's cut-off."""
     mode, extensions = spec.get("alphaMode", "OPAQUE"), spec.get("extensions", {})
     for name, entry in TRANSPARENT.items():
