@@ -20,6 +20,7 @@ import io
 import itertools
 import warnings
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import unquote, unquote_to_bytes
@@ -44,7 +45,12 @@ MOST_NAMES = 3  # in a message
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
-SRGB_TABLE = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+CURVES: dict[str, np.ndarray] = {  # values of encoded texels; those of a normal map are components of directions
+    "linear": LEVELS,
+    "sRGB": srgb_to_linear(np.arange(256) / 255).astype(np.float32),
+    "direction": (2 * (np.arange(256) / 255) - 1).astype(np.float32),
+}
+RGB = (0, 1, 2)  # channels of texels
 
 
 def extra(package: str, name: str = "meshes") -> Any:
@@ -131,6 +137,7 @@ class Loading:
         self.strict = transparent_parts == "refuse"  # nothing may be missing or replaced
         self.ignored: set[str] = set()
         self._said: dict[str, dict[str, None]] = {}  # beginning of a sentence -> names, in order
+        self._images: dict[str, Texels | None] = {}
 
     def read(self, uri: str, needed: bool = False) -> bytes | None:
         """Bytes of the file at `uri` (percent escapes as in glTF), or of a data URI; None if it is missing.
@@ -154,16 +161,20 @@ class Loading:
         self.go_on_without("names a file that is missing", repr(unquote(uri)), needed)
         return None
 
-    def read_image(self, uri: str) -> np.ndarray | None:
-        """Texels (h, w, 4) of the image at `uri`; None if it is missing or cannot be read."""
-        data = self.read(uri)
-        return None if data is None else self.decode_image(data, uri[:80])
+    def read_image(self, name: str, data: bytes | memoryview | None = None) -> "Texels | None":
+        """The image of that name, of `data` or else of the file at this uri; None if it is missing or cannot be read.
 
-    def decode_image(self, data: bytes, name: str) -> np.ndarray | None:
-        """Texels (h, w, 4) of the bytes of an image; None if they cannot be read."""
+        It is decoded once.
+        """
+        if name not in self._images:
+            content = self.read(name) if data is None else bytes(data)
+            self._images[name] = None if content is None else self._decode_image(content, name[:80])
+        return self._images[name]
+
+    def _decode_image(self, content: bytes, name: str) -> "Texels | None":
         try:
             with refusing(name):
-                return decode_image(data)
+                return Texels(decode_image(content))
         except UserError as error:
             self.go_on_without("names an image that cannot be read", str(error))
         return None
@@ -229,6 +240,16 @@ def _find(folder: Path, names: list[str]) -> Path | None:
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
+
+
+class Texels:
+    """Encoded texels (h, w, 4) of an image; the values of channels are computed once for all materials that show it."""
+
+    def __init__(self, encoded: np.ndarray):
+        self.encoded, self.values = encoded, cache(self._values)
+
+    def _values(self, channels: int | tuple[int, ...], curve: str) -> np.ndarray:
+        return decode_texels(self.encoded[..., channels], CURVES[curve])
 
 
 def decode_image(data: bytes) -> np.ndarray:

@@ -8,7 +8,7 @@ reference converter.  A material has the texture coordinates of its first textur
 replaced by its mean.  Features that are not modelled are listed in `ignored`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import LEVELS, SRGB_TABLE, Loading, Material, Part, Wrap, decode_texels
+from spnr_jax.formats.assets import RGB, Loading, Material, Part, Texels, Wrap
 from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.formats.gltf_file import DRACO, MESHOPT, GltfFile
 from spnr_jax.kernels.triangles import strip_faces
@@ -40,11 +40,6 @@ MATERIALS = "KHR_materials_"  # prefix; the ones that are not modelled are liste
 MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}, ("JOINTS_", "WEIGHTS_")
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
-RGB = (0, 1, 2)  # channels of texels
-# values (256,) of encoded texels; those of a normal map are components of directions
-CURVES: dict[str, np.ndarray] = {
-    **{"linear": LEVELS, "sRGB": SRGB_TABLE, "direction": (2 * (np.arange(256) / 255) - 1).astype(np.float32)},
-}
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
 # texels instead of a missing image: grey 0.5; roughness 0.5, metallic 0; specular 0.04, glossiness 0.5; flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
@@ -68,7 +63,7 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
     ignored |= {"animations"} & document.keys()
     others = {*document.get("extensionsUsed", [])} - READ - HARMLESS
     ignored |= {name for name in others if not name.startswith(MATERIALS)}
-    read_look = cache(partial(read_material, file, cache(partial(_read_image, file))))
+    read_look = cache(partial(read_material, file))
     shapes: dict[int, tuple[Columns, np.ndarray]] = {}  # by id of the primitive, which the document keeps alive
     parts, repeated = [], 0
     for primitive, matrix, joints in drawn:
@@ -247,22 +242,8 @@ class Placement(NamedTuple):
     offset: tuple = (0.0, 0.0)
 
 
-class Texels:
-    """Encoded texels (h, w, 4); their values are computed once for all materials that show them."""
-
-    def __init__(self, encoded: np.ndarray):
-        self.encoded, self.values = encoded, cache(self._values)
-
-    def _values(self, channels: int | tuple[int, ...], curve: str) -> np.ndarray:
-        return decode_texels(self.encoded[..., channels], CURVES[curve])
-
-
 def _read_texture(
-    file: GltfFile,
-    read_image: Callable[[int], Texels | None],
-    places: list[Placement],
-    info: dict | None,
-    stand_in: tuple[int, ...],
+    file: GltfFile, places: list[Placement], info: dict | None, stand_in: tuple[int, ...]
 ) -> Texels | None:
     """Texels of a textureInfo, or `stand_in` (4,) for a missing image.
 
@@ -271,7 +252,7 @@ def _read_texture(
     """
     if info is None:
         return None
-    texels = read_image(info["index"]) or Texels(np.array(stand_in, np.uint8).reshape(1, 1, 4))
+    texels = _read_image(file, info["index"]) or Texels(np.array(stand_in, np.uint8).reshape(1, 1, 4))
     places.append(_placement(file, info))
     if places[-1] == places[0]:
         return texels
@@ -290,10 +271,8 @@ def _read_image(file: GltfFile, index: int) -> Texels | None:
         return None
     image = file.document["images"][source]
     if "uri" in image:
-        encoded = file.loading.read_image(image["uri"])
-    else:
-        encoded = file.loading.decode_image(bytes(file.view(image["bufferView"])), f"image {source}")
-    return None if encoded is None else Texels(encoded)
+        return file.loading.read_image(image["uri"])
+    return file.loading.read_image(f"image {source}", file.view(image["bufferView"]))
 
 
 def _placement(file: GltfFile, info: dict[str, Any]) -> Placement:
@@ -313,13 +292,10 @@ def _placement(file: GltfFile, info: dict[str, Any]) -> Placement:
     return Placement(wrap, number, tuple(map(tuple, turn.tolist())), (float(x), float(y)))
 
 
-def read_material(
-    file: GltfFile, read_image: Callable[[int], Texels | None], index: int | None
-) -> tuple[Material | None, Placement]:
+def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, Placement]:
     """Material `index` of a file (None if it is invisible everywhere) and the placement of its textures.
 
-    `read_image` gives the texels of a texture.  Index None: glTF's default, a rough metal, for references; for a
-    picture, a white dielectric.
+    Index None: glTF's default, a rough metal, for references; for a picture, a white dielectric.
     """
     loading, spec = file.loading, {} if index is None else file.document["materials"][index]
     if index is None and not loading.strict:
@@ -327,7 +303,7 @@ def read_material(
         loading.say("parts without a material: roughness 0.5 and metallic 0 taken")
     name, extensions = str(spec.get("name", f"number {index}")), spec.get("extensions", {})
     places: list[Placement] = []
-    read = partial(_read_texture, file, read_image, places)
+    read = partial(_read_texture, file, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
     look, of_color = (spec.get("pbrMetallicRoughness", {}), "baseColor") if glossy is None else (glossy, "diffuse")
     color, factor = read(look.get(f"{of_color}Texture"), GREY), look.get(f"{of_color}Factor", (1, 1, 1, 1))

@@ -20,7 +20,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
-from spnr_jax.formats.assets import Loading, Material, Part, decode_texels, make_material
+from spnr_jax.formats.assets import RGB, Loading, Material, Part, Texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
 from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.polygons import colored_part
@@ -211,7 +211,7 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
         return make_material(), UNMOVED
     if loading.strict:  # transparency is a clearer error than a missing file
         loading.cut_out(name, make_material(), *_alpha(entry, None))
-    maps: dict[str, np.ndarray] = {}
+    maps: dict[str, Texels] = {}
     move = UNMOVED
     wrap: assets.Wrap = "repeat"
     for key in MAPS:
@@ -236,14 +236,14 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
     if "map_kd" in maps:
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
-        color = decode_texels(maps["map_kd"][..., :3], assets.SRGB_TABLE)
+        color = maps["map_kd"].values(RGB, "sRGB")
     shiny, highlight = 0.5, max(float(entry.get("ns", 0)), 0)
     if "ns" in entry and "blender" in entry:
         shiny = 1 - min(highlight / float(entry["blender"]), 1) ** 0.5
     elif "ns" in entry and entry.get("illum") not in ("0", "1") and entry.get("ks", "1").strip("0. "):
         shiny = (2 / (highlight + 2)) ** 0.5
     roughness, metallic = (
-        decode_texels(maps[f"map_{key}"][..., 0]) if f"map_{key}" in maps else float(entry.get(key, plain))
+        maps[f"map_{key}"].values(0, "linear") if f"map_{key}" in maps else float(entry.get(key, plain))
         for key, plain in (("pr", shiny), ("pm", 0))
     )
     material = make_material(color, roughness, metallic, wrap)
@@ -256,15 +256,16 @@ def _pair(words: Sequence[str], default: float) -> tuple[float, float]:
     return one, two
 
 
-def _alpha(entry: dict[str, str], map_d: np.ndarray | None) -> tuple[str, np.ndarray, float | int | None]:
+def _alpha(entry: dict[str, str], map_d: Texels | None) -> tuple[str, np.ndarray, float | int | None]:
     """The statement that makes an entry transparent ("": opaque), its alpha () or (h, w), and a mask's cut-off."""
     if "map_d" in entry:
         if map_d is None:
             return "map_d", np.ones(()), assets.MOSTLY_OPAQUE
         # a grey picture is the alpha itself; of a coloured one its alpha channel
-        own = entry["map_d"] != entry.get("map_kd") and np.ptp(map_d[..., :3], axis=-1).max() <= NEARLY_GREY
-        alpha = map_d[..., 0 if own and map_d[..., 3].min() == 255 else 3]
-        return "map_d", decode_texels(alpha), assets.MOSTLY_OPAQUE
+        encoded = map_d.encoded
+        own = entry["map_d"] != entry.get("map_kd") and np.ptp(encoded[..., :3], axis=-1).max() <= NEARLY_GREY
+        alpha = map_d.values(0 if own and encoded[..., 3].min() == 255 else 3, "linear")
+        return "map_d", alpha, assets.MOSTLY_OPAQUE
     if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
         return f"d {opacity:g}", np.asarray(opacity), None
     if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import SRGB_TABLE, Loading, Part, decode_texels, make_material
+from spnr_jax.formats.assets import RGB, Loading, Part, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.row_files import Lists, read_elements, read_header
@@ -80,7 +80,7 @@ def _textured(
     texcoords = texcoords * [1, -1] + [0, 1]
     parts = []
     for i, image in enumerate(images):
-        material = make_material(decode_texels(image[..., :3], SRGB_TABLE))
+        material = make_material(image.values(RGB, "sRGB"))
         own = faces[number == i]
         parts.append(Part(positions=positions, faces=own, material=material, normals=normals, texcoords=texcoords))
     return parts
