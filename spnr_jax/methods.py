@@ -209,6 +209,8 @@ def from_dict(values: Any, kind: Any = TrainConfig, path: str = "") -> Any:
     place = f"config field {path[:-1]}" if path else "the config"
     require(isinstance(values, dict), f"{place} holds {values!r}, which is no JSON object")
     extra = EXTRA_FIELDS.get(kind, ())
+    if kind is LossConfig and values.get("pixel") == "mse":  # then l1_weight was that of squared errors
+        values = values | {"l1_weight": 0.0, "mse_weight": values.get("l1_weight")}
     if kind is NetworkConfig:
         kind = _find_config_class(values.get("method"), values.get("source"), path)
     kinds = types_of(kind)

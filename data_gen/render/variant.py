@@ -20,7 +20,7 @@ LIBRARY_NAME = re.compile(r"libLLVM(?:-|\.so\.)(\d+)[\d.]*(?:\.so[\d.]*|\.dylib)
 LIBRARY_ROOTS = ("/usr", "/usr/local", "/opt/homebrew", sys.prefix, sys.base_prefix)
 SLOW_NOTICE = (
     "rendering with Mitsuba's scalar_rgb: no usable LLVM library was found; to render about three times faster, "
-    "install LLVM 16 or newer (Debian and Ubuntu: libllvm19), or set DRJIT_LIBLLVM_PATH to its libLLVM file"
+    "install LLVM 17 or newer (Debian and Ubuntu: libllvm19), or set DRJIT_LIBLLVM_PATH to its libLLVM file"
 )
 PROBE = """
 import mitsuba as mi
@@ -46,7 +46,7 @@ def choose_variant(requested: str = "auto") -> tuple[str, str | None]:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
             return LLVM, None
     if requested == LLVM:
-        raise UserError(f"variant: {LLVM} does not run here; install LLVM 16 or newer, or use --variant {SCALAR}")
+        raise UserError(f"variant: {LLVM} does not run here; install LLVM 17 or newer, or use --variant {SCALAR}")
     return SCALAR, SLOW_NOTICE
 
 

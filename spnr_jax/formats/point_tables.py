@@ -57,13 +57,13 @@ THOUSANDS = (
     re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"),
 )
 PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
-PACKED = re.compile(r"\s*(?:#([0-9a-f]{6})(?:[0-9a-f]{2})?|0x([0-9a-f]{6}))\s*", re.IGNORECASE)  # colour
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
-EMPTY = re.compile(r"(?<=[,;])\s*(?=[,;]|$)")  # a missing number
-# of C, of databases, and a single dash
-UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b|(?<![^\s,;])-(?![^\s,;])", re.IGNORECASE)
+EMPTY = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;]|$)")  # a missing number
+UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
+DASH = re.compile(r"(?<![^\s,;])-(?![^\s,;])")  # a missing number, but in the first row
 FORTRAN = re.compile(r"(?<![#\w.])([+-]?(?:\d+(?:\.\d*)?|\.\d+))d(?=[+-]?\d)", re.IGNORECASE)  # exponents
 WHOLE = re.compile(r"(?<=\d)\.0+(?![\d.ed])", re.IGNORECASE)
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
@@ -153,8 +153,8 @@ def _words(line: str) -> list[str]:
 
 
 def _packed_color(word: str) -> float:
-    """The number 0xRRGGBB of a word #rrggbb, #rrggbbaa or 0xrrggbb, NaN for other words."""
-    return float(int(found[1] or found[2], 16)) if (found := PACKED.fullmatch(word)) else np.nan
+    """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
+    return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:
@@ -167,12 +167,12 @@ def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
     for number, line in lines:
         words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
         numbered = words == list(map(str, range(len(words))))  # pandas' names of unnamed columns
-        fields, above = (_words(text) for text in (line[:LONGEST_HEADER], ["", *before][-1]))
-        below_names = len(fields) == len(above) and not any(map(_is_number, above))  # the row may begin with a word
-        below_names = below_names and sum(map(bool, map(NUMBER.fullmatch, map(str.strip, fields)))) >= 3
+        fields, above = ([*map(_is_number, _words(text))] for text in (line[:LONGEST_HEADER], ["", *before][-1]))
+        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # the row may begin with a word
         if (NUMBER.fullmatch(words[0]) or below_names) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
             return [*before], (number, line)
-        before.append(line[:LONGEST_HEADER])
+        if any(map(str.isalnum, line)):  # else a line of marks alone
+            before.append(line[:LONGEST_HEADER])
     return [*before], (0, "")
 
 
@@ -191,7 +191,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
-    texts = [FORTRAN.sub(r"\1e", WHOLE.sub("", UNDEFINED.sub("nan", text))) for text in texts]
+    texts = [FORTRAN.sub(r"\1e", WHOLE.sub("", UNDEFINED.sub("nan", DASH.sub("nan", text)))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)
     for (number, text), plain in zip(rows, texts, strict=True):
@@ -220,11 +220,11 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
             found.append((names, below.copy()))
         elif "x" in names and not is_remark:
             unfit = unfit or names
-        if not (line.startswith(COMMENTS) or COUNT.fullmatch(line[:SHOWN])) and any(map(str.isalnum, line)):
+        if not (line.startswith(COMMENTS) or COUNT.fullmatch(line[:SHOWN])):
             below.append(line)
     names, below = next((pair for pair in found if name_places(pair[0])), [*found, ([], [])][0])
     if below:
-        report(f"lines below the names that hold no numbers and are not read: {list_names(below[::-1])}")
+        report(f"lines below the names that are not read: {list_names(below[::-1])}")
     if names:
         names += [""] * (count - len(names))  # separators at the end of the line
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))

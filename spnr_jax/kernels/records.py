@@ -102,10 +102,10 @@ class Rendering:
     """
 
     image: Float[Array, "*batch height width 3"]
+    image_lr: Float[Array, "*batch height_lr width_lr 3"] | None = struct.field(default=None, kw_only=True)
+    """The image before the upsampler; networks without one leave it out."""
     depth: Float[Array, "*batch height_lr width_lr"]
     acc: Float[Array, "*batch height_lr width_lr"]
-    image_lr: Float[Array, "*batch height_lr width_lr 3"] | None = None
-    """The image before the upsampler; networks without one leave it out."""
     overflow: Int[Array, "*batch"] | None = None
     """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 

@@ -126,7 +126,8 @@ def reconstruction_loss(
 ) -> Float[Array, ""]:
     """Weighted errors of the image, and L1 of the low-resolution rendering against the downsampled reference."""
     error = mean_error(jnp.abs(image - reference), mask)
-    if config.model.upsamples and image_lr is not None:
+    if config.model.upsamples:
+        assert image_lr is not None, "a network that upsamples returns image_lr"
         low = losses.area_downsample(reference, image_lr.shape[-2])
         error = error + config.loss.low_resolution_weight * losses.l1(image_lr, low)
     error = config.loss.l1_weight * error

@@ -126,7 +126,7 @@ class PaperNetwork(nn.Module):
             image = self.upsampler(resize_bilinear(features, camera.height // 2, camera.width // 2))
         return Rendering(
             image=image.reshape(*views, camera.height, camera.width, 3),
-            image_lr=features[..., :3].reshape(*views, height, width, 3),
+            image_lr=features[..., :3].reshape(*views, height, width, 3) if self.config.upsamples else None,
             depth=rendered.depth.reshape(*views, height, width),
             acc=rendered.acc.reshape(*views, height, width),
         )

@@ -38,7 +38,6 @@ THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROW
 GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
 LOUD, V_NAMES = ply_bytes("ascii", rows=FLOATS, properties=XYZRGB).replace(b"float", b"Float"), "V1 V2 V3 V4 V5 V6\n"
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
-BELOW = "lines below the names that hold no numbers and are not read: x1,,5, m,m,m"
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
@@ -70,8 +69,16 @@ TEXTS = {
     "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
     "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
     "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
-    "packed colours in words, with alpha": ("a.csv", "x,y,z,colour\n" + table(",", ",#28aa3c80", columns=POINTS)),
-    "a row of dashes": ("a.txt", "x y z r g b\n- - - - - -\n" + table(" ") + "1 - 1 1 2 3\n"),
+    "rows of dashes": (
+        "a.txt",
+        "b g r z y x\n" + 150 * "- - - - - -\n" + table(" ", columns=BACKWARDS) + "1 - 1 1 2 3\n",
+    ),
+    "first rows undefined": ("a.csv", "b,g,r,z,y,x\n" + 150 * ",,null,,,\n" + table(",", columns=BACKWARDS)),
+    "a first row with words and without a number": (
+        "a.csv",
+        "i,x,y,z,r,g,b\nP,null,1,1,1,2,3\n" + WORDY.split("\n", 1)[1],
+    ),
+    "a label that is a dash, then words": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,-\n" + table(",", ",car")),
     "names in any file, minus signs": ("a.prn", "  X Y Z R G B\n" + table("  ").replace("-", "\N{MINUS SIGN}")),
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
@@ -172,8 +179,8 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         (
             "a.csv",
-            "x,y,z,u,v\nx1,,5,,\nm,m,m,,\n" + GREYS,
-            "lines below the names that hold no numbers and are not read: x1,,5,,, m",
+            "x,y,z,u,v\ntop left,,\nm,m,m,,\n" + GREYS,
+            "lines below the names that are not read: top left,,, m,m,m,,",
         ),
         (
             "a.csv",
