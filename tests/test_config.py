@@ -126,3 +126,11 @@ class TestOfAFile:
         del values["loss"]["r1_gamma"]
         with pytest.raises(ValueError, match=r"loss\.r1_gamma is missing"):
             from_dict(values)
+
+
+@pytest.mark.parametrize(("pixel", "weights"), [("l1", (3.0, 0.5)), ("mse", (0.0, 3.0))])
+def test_a_file_from_before_squared_errors_had_one_weight_means_what_it_did(pixel, weights):
+    values = to_dict(replace(tiny(), loss=LossConfig(l1_weight=3.0, mse_weight=0.5)))
+    values["loss"]["pixel"] = pixel
+    loss = from_dict(values).loss
+    assert (loss.l1_weight, loss.mse_weight) == weights
