@@ -25,7 +25,7 @@ import numpy as np
 from PIL import Image
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.point_tables import pack_arrays
+from spnr_jax.formats.array_files import pack_arrays
 
 SCHEMA_VERSION = 1
 LAST_FILE = "object.json"  # its presence makes an object complete

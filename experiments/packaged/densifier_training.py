@@ -25,9 +25,9 @@ from data_gen.plan.sources import find_meshes
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.errors import UserError
 from spnr_jax.formats import meshes
+from spnr_jax.formats.array_files import pack_arrays, read_arrays
 from spnr_jax.formats.assets import Asset
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.point_tables import pack_arrays, read_arrays
 from spnr_jax.formats.surface_points import normalise, sample_surface
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import farthest_points

@@ -12,9 +12,9 @@ import numpy as np
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, is_bug
 from spnr_jax.formats import clouds
+from spnr_jax.formats.array_files import read_arrays
 from spnr_jax.formats.assets import decode_image
 from spnr_jax.formats.camera_files import cameras_of
-from spnr_jax.formats.point_tables import read_arrays
 from spnr_jax.kernels.records import Camera, Light, PointCloud
 from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of
 

@@ -1,7 +1,7 @@
 """The kind of a file, by its first bytes if they tell, else by its suffix; and its points as named columns.
 
-READERS maps each kind to its reader, in row_files.py (.ply .pcd), point_tables.py (text, .npz .npy), las.py or
-gaussian_files.py.  Meshes (meshes.py) without faces are read as points.
+READERS maps each kind to its reader, in row_files.py (.ply .pcd), point_tables.py (text), array_files.py (.npz .npy),
+las.py or gaussian_files.py.  Meshes (meshes.py) without faces are read as points.
 
 A reader yields pieces of some ten megabytes, so that a file may be larger than the memory; archives, meshes and
 compressed files come in one piece.  Columns have the names and types of the file; columns.py interprets them.
@@ -15,10 +15,11 @@ from functools import partial
 from pathlib import Path
 
 from spnr_jax.errors import UserError
+from spnr_jax.formats.array_files import numpy_pieces
 from spnr_jax.formats.columns import Columns, Report
 from spnr_jax.formats.gaussian_files import spz_columns
 from spnr_jax.formats.las import las_pieces
-from spnr_jax.formats.point_tables import encoding_of, numpy_pieces, text_pieces
+from spnr_jax.formats.point_tables import encoding_of, text_pieces
 from spnr_jax.formats.row_files import read_elements, read_header, row_pieces
 
 TEXT = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts")

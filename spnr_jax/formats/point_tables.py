@@ -1,21 +1,13 @@
-"""Tables of points as named columns, piece by piece: text (.xyz .txt .csv .asc .pts) and NumPy files (.npz .npy).
+"""Tables of points in text (.xyz .txt .csv .asc .pts) as named columns, piece by piece; names of columns without any.
 
 Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
 or if something else separates the numbers; 1.234,5 has a thousand.  Lines of a single integer are counts of points.  A
 header line, also one after #, % or //, names the columns; columns without a name, or of words, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
-
-    .npz    named arrays (points, c) or (points,); an array of positions may have more columns, as in text
-    .npy    a structured array of named fields, or an array (points, columns) or (height, width, columns), as in text
-
-Pickled objects, which could run code, are refused.
 """
 
 import contextlib
-import io
 import re
-import threading
-import warnings
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
@@ -24,18 +16,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from spnr_jax.errors import UserError, refusing
+from spnr_jax.errors import UserError
 from spnr_jax.formats.columns import (
-    ARRAYS,
     NORMAL,
-    PLACES,
     POSITION,
     Columns,
     Report,
     list_names,
-    name_columns,
     name_places,
-    plain_name,
 )
 
 Line = tuple[int, str]  # line number in the file, from 1, and text
@@ -45,8 +33,7 @@ OPAQUE = (1, 255, 65535)  # usual constant values of alpha
 UNIT_LENGTH = 0.02  # tolerance of the length of a normal
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of sRGB (BT.601)
 CLOSE = 0.15  # difference of correlations below which the choice of colour columns is reported as ambiguous
-SINGLE = 4  # an array of at most so many numbers does not belong to the points
-PIECE_LINES, PIECE_BYTES = 2**17, 2**25  # of text, and of an array, in memory at a time
+PIECE_LINES = 2**17  # in memory at a time
 SHOWN, LONGEST_HEADER = 60, 4096  # characters of a line shown in errors, and searched for names
 MOST_LINES, MOST_COLUMNS = 99, 16  # lines above the numbers searched for names; columns of an unnamed table
 COMMENTS = ("#", "//", "%")
@@ -61,16 +48,17 @@ PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
-EMPTY = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;]|$)")  # a missing number
-UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|\b(n/?a|null|none)\b", re.IGNORECASE)  # of C and databases
+EMPTY = {mark: re.compile(rf"(?:^|(?<={mark}))[^\S{mark}]*(?={mark}|$)") for mark in ",;\t"}  # a missing number
+UNDEFINED = re.compile(
+    r"[+-]?(nan\([a-z]*\)|1\.#\w+)|#n/?a|#nv|\b(n/?a|null|none)\b", re.IGNORECASE
+)  # of C and databases
 DASH = re.compile(r"(?<![^\s,;])-(?![^\s,;])")  # a missing number, but in the first row
 FORTRAN = re.compile(r"(?<![#\w.])([+-]?(?:\d+(?:\.\d*)?|\.\d+))d(?=[+-]?\d)", re.IGNORECASE)  # exponents
 WHOLE = re.compile(r"(?<=\d)\.0+(?![\d.ed])", re.IGNORECASE)
+ONE_IN_BRACKETS = re.compile(r"[\[({][\d.,]+[])}]")  # accountants' negative numbers
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
+AROUND_NAMES = re.compile(r"^[^:=]*[:=]|[][(){}'\"]")
 INDEX = "index"  # name of a column that is not used
-MOST_BYTES = 2**31  # of an archive's arrays when unpacked: a small file can declare any size
-PARSER = threading.Lock()  # ast.literal_eval, which NumPy reads headers with, is not thread-safe (gh-106905)
-UNNAMED = tuple(f"arr{i}" for i in range(9))  # np.savez's names of arrays passed without one
 
 
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
@@ -84,40 +72,70 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
         delimiter = next((mark for mark in ";," if mark in first[1]), None)
         parts = first[1].split()
-        if delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
+        if first[1].count("\t") in {line.count("\t") for line in before} - {0, 1}:
+            delimiter = "\t"
+        elif delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
             delimiter = None  # these are decimal commas
         headers = {line for line in before if not NUMBER.match(line)}  # repeated where files were concatenated
         announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
 
+        words = [word.replace(",", ".") for word in first[1].split(delimiter)]
+        unread = {i: _packed_color for i, word in enumerate(words) if not _is_number(word)}
+        commented = sum(_is_commented_row(line, len(words)) for line in before)
+
         def rows_of_numbers() -> Iterator[Line]:
-            nonlocal announced
+            nonlocal announced, commented
             for number, text in chain([first], numbered):
                 if text.isdecimal():
                     announced += int(text[:SHOWN])
-                elif text and not text.startswith(COMMENTS) and text not in headers:
-                    text = EMPTY.sub("nan", text) if delimiter else text
+                elif text.startswith(COMMENTS):
+                    commented += _is_commented_row(text, len(words))
+                elif text and text not in headers:
+                    text = EMPTY[delimiter].sub("nan", text) if delimiter else text
                     yield number, text if delimiter == "," else text.replace(",", ".")
+
+        def load(rows: list[Line]) -> np.ndarray:
+            return load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
 
         lines = rows_of_numbers()
         names: tuple[str, ...] = ()
-        found = 0
-        words = [word.replace(",", ".") for word in first[1].split(delimiter)]
-        unread = {i: _packed_color for i, word in enumerate(words) if not _is_number(word)}
+        found, colorless = 0, 0
         while rows := list(islice(lines, PIECE_LINES)):
             found += len(rows)
-            table = load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
+            broken = UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+            try:
+                table = load(rows)
+            except UserError as error:
+                if names:
+                    raise
+                broken = error  # unless the words stand in columns that are not used
+                columns = zip(*(text.split(delimiter) for _, text in rows), strict=False)
+                mostly = [i for i, fields in enumerate(columns) if np.mean([*map(_is_number, fields)]) < 0.5]
+                unread |= dict.fromkeys(mostly, _packed_color)
+                table = load(rows)
             if not names:
-                names = _names(before, table, path.suffix.lower(), report)
+                names = _names(before, table, unread, path.suffix.lower(), report)
                 if {names[i] for i in unread} & {*"xyz", *COLOR}:
-                    raise UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+                    raise broken
                 of_words = {i: f"{names[i]} (words)" for i in unread}
-                hexadecimal = [i for i in unread if PACKED.fullmatch(words[i]) and COLORED.search(names[i])]
+                hexadecimal = [i for i in unread if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
                 of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
                 names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
+                doubtful = [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]
+                if doubtful:
+                    where = ", ".join(doubtful)
+                    report(
+                        f"whole numbers among small ones of three decimals in {where}: write thousands without marks"
+                    )
+            colorless += sum(int(np.isnan(table[:, i]).sum()) for i in unread if names[i] == "rgb")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
             end = ": is the file cut off?" if announced > found else ""
             report(f"a line of the file announces {announced:,} points, {found:,} are there{end}")
+        if commented:
+            report(f"{commented:,} rows that begin with a mark of remarks (# // %) are not read")
+        if colorless:
+            report(f"{colorless:,} of {found:,} colours are no #rrggbb, and taken as black")
 
 
 def open_text(path: Path) -> TextIO:
@@ -139,7 +157,7 @@ def _plain(line: str) -> str:
     if PLAIN.fullmatch(text := line.strip()):
         return text
     text = text.strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
-    if text[:1] in ("[", "(", "{"):
+    if text[:1] in ("[", "(", "{") and not ONE_IN_BRACKETS.match(text):
         text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
     if '"' in text:
         text = re.sub('"([^"]*)"?', lambda found: THOUSANDS[0].sub("", found[1]).replace(",", "."), text)
@@ -152,13 +170,30 @@ def _words(line: str) -> list[str]:
     return [word.strip("' \t") for word in (line.split(mark) if mark or "\t" not in line else re.split(r"\t+", line))]
 
 
+def _is_commented_row(line: str, count: int) -> bool:
+    """Whether a line is a remark that looks like a row of `count` fields."""
+    fields = _words(line)
+    return line.startswith(COMMENTS) and len(fields) == count and sum(map(_is_number, fields)) > 1
+
+
+def _are_cut(values: np.ndarray) -> bool:
+    """Whether numbers (n,) look as if marks of thousands were taken for decimal ones: 1.987 among 705 and 12."""
+    size = np.abs(values[np.isfinite(values)])
+    whole = size % 1 == 0
+    if not 0.05 < np.mean(whole) < 0.95:
+        return False
+    small = size[~whole]
+    three = np.abs(1000 * small - np.round(1000 * small)).max() < 1e-6
+    return bool(three and small.min() >= 1 and 10 * small.max() < size[whole].max())
+
+
 def _packed_color(word: str) -> float:
     """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
     return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:
-    return bool(not word.strip() or NUMBER.fullmatch(word.strip()) or UNDEFINED.fullmatch(word.strip()))
+    return not (word := word.strip()) or any(form.fullmatch(word) for form in (NUMBER, UNDEFINED, WITH_COMMA))
 
 
 def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
@@ -202,23 +237,28 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 
-def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) -> tuple[str, ...]:
-    """Column names of a table: from a line above it that names positions, else from the values."""
-    count, filled = table.shape[1], 1 + int(np.flatnonzero(~np.isnan(table).all(axis=0)).max(initial=2))
+def _names(
+    before: list[str], table: np.ndarray, unread: Collection[int], suffix: str, report: Report
+) -> tuple[str, ...]:
+    """Column names of a table: from a line above it that names positions, else from the values.
+
+    `unread` are columns of words.
+    """
+    count, known = table.shape[1], np.flatnonzero(~np.isnan(table).all(axis=0))
+    filled = 1 + int(max(2, *known, *unread))
     found: list[tuple[list[str], list[str]]] = []  # names, and lines between them and the numbers
     unfit, below = list[str](), list[str]()
     for line in reversed(before):
-        text = UNITS.sub("", line.lstrip("#/% "))
-        names = [name.lower() for name in _words(text)]
-        if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks
-            names = text.lower().split()
-        while len(names) > filled and not names[-1]:
-            names.pop()
+        remark = line.lstrip("#/%;! ")
+        plain = UNITS.sub("", line if remark == line else _plain(remark))
+        names = _fields_of_names(plain, filled, count)
+        if line.startswith(COMMENTS) and not filled <= len(names) <= count:  # "columns: [x, y, z]"
+            names = _fields_of_names(AROUND_NAMES.sub(" ", plain).strip(" ,;"), filled, count)
         # V1, V2 ... of R and Matlab name nothing
         is_remark = line.startswith(COMMENTS) or NUMBER.match(line) or len({re.sub(r"\d", "", x) for x in names}) == 1
         if filled <= len(names) <= count and (name_places(names) or not is_remark):
             found.append((names, below.copy()))
-        elif "x" in names and not is_remark:
+        elif name_places(names) and not is_remark:
             unfit = unfit or names
         if not (line.startswith(COMMENTS) or COUNT.fullmatch(line[:SHOWN])):
             below.append(line)
@@ -227,15 +267,30 @@ def _names(before: list[str], table: np.ndarray, suffix: str, report: Report) ->
         report(f"lines below the names that are not read: {list_names(below[::-1])}")
     if names:
         names += [""] * (count - len(names))  # separators at the end of the line
+        if twice := [x for i, x in enumerate(names) if x and x in names[:i]]:
+            report(f"names that occur twice, of which the first column is read: {list_names(twice)}")
         return tuple(INDEX if not x or x in names[:i] else x for i, x in enumerate(names))
     if len(unfit) == count - 1 and len(table) > 1 and (np.diff(table[:, 0]) == 1).all():  # R: unnamed row numbers
         return (INDEX, *unfit)
     if unfit:
         hint = "; decimal commas need another separator" if count == 2 * len(unfit) else ""
         raise UserError(f"names {len(unfit)} columns ({' '.join(unfit)}) above {count} columns of numbers{hint}")
+    orders = [re.findall(r"(?<![^\W_])[xyz](?![^\W_])", line.lower()) for line in before]
+    if misread := [line for line, order in zip(before, orders, strict=True) if sorted(order) == [*"xyz"] < order]:
+        report(f"lines that may name the columns in another order, and are not understood: {list_names(misread)}")
     of_format = suffix == ".pts" and filled == 7
     guessed = (*"xyz", "intensity", *COLOR) if of_format else plain_names(table[:, :filled], report)
     return (*guessed, *[INDEX] * (count - filled))
+
+
+def _fields_of_names(text: str, filled: int, count: int) -> list[str]:
+    """The names in a line, in lower case, for a table of `count` columns, of which the first `filled` hold numbers."""
+    names = [name.lower() for name in _words(text)]
+    if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks
+        names = text.lower().split()
+    while len(names) > filled and not names[-1]:
+        names.pop()
+    return names
 
 
 def plain_names(table: np.ndarray, report: Report) -> tuple[str, ...]:
@@ -316,98 +371,3 @@ def _likeness(table: np.ndarray, start: int) -> float:
             return 2.0
     correlation = np.abs(np.corrcoef(values.T))
     return max(0.0, round(float(np.min([correlation[0, 1], correlation[1, 2]])), 1))
-
-
-# --- NumPy ------------------------------------------------------------------------------------------------------------
-
-
-def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns of an array (.npy), some points at a time, or of an archive (.npz)."""
-    with path.open("rb") as file:
-        magic = file.read(6)
-        file.seek(0)
-        if magic.startswith(b"PK"):
-            arrays = read_arrays(file, (*PLACES.split(), *ARRAYS, *UNNAMED), report)
-            tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
-            yield _archive_columns(tables, report)
-            return
-    broken = "is a broken, truncated or pickled NumPy file: save arrays, as np.savez(file, points=..., colors=...)"
-    try:
-        with _parsing(broken):
-            rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
-    except MemoryError:  # the header is nested too deeply for Python's parser
-        raise UserError(broken) from None
-    if rows.ndim == 3 and rows.dtype == np.uint8:
-        raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
-    fields = rows.dtype.names
-    rows = rows.reshape(-1) if fields else _as_rows(rows, report)
-    names = fields or plain_names(rows[:PIECE_LINES], report)
-    step = max(1, PIECE_BYTES // max(1, rows[:1].nbytes))
-    for start in range(0, max(1, len(rows)), step):
-        piece = np.array(rows[start : start + step])
-        yield name_columns({name: piece[name] if fields else piece[:, i] for i, name in enumerate(names)})
-
-
-def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
-    """A table (points, c) of a table (points, c) or (c, points) or a point map (h, w, c)."""
-    if array.ndim == 3 and min(array.shape[:2]) > 1:
-        report(f"an array of {' x '.join(map(str, array.shape))} taken as one cloud; of a batch, save array[0] alone")
-    table = array.reshape(-1, array.shape[2]) if array.ndim == 3 else array
-    if table.ndim < 2 or not 3 <= len(table) <= MOST_COLUMNS < table.shape[1]:
-        return table
-    report(f"an array of {len(table)} x {table.shape[1]} taken as one column for each point")
-    return table.T
-
-
-@contextlib.contextmanager
-def _parsing(broken: str) -> Iterator[None]:
-    """Context for NumPy to read a file: one thread at a time, no warnings about old headers; UserError if broken."""
-    with refusing(broken), PARSER, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-def pack_arrays(arrays: dict[str, np.ndarray], *, compressed: bool = False) -> bytes:
-    """The bytes of an .npz archive of named arrays."""
-    stream = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(stream, allow_pickle=False, **arrays)
-    return stream.getvalue()
-
-
-def read_arrays(
-    file: io.BufferedIOBase, wanted: Collection[str] | None = None, report: Report = lambda line: None
-) -> dict[str, np.ndarray]:
-    """The wanted arrays of an .npz archive; reports the others; ValueError if it is broken or unpacks to too much."""
-    with _parsing("is a broken or truncated NumPy file"), np.load(file, allow_pickle=False) as archive:
-        names = [name for name in archive.files if wanted is None or {name, plain_name(name)} & {*wanted}]
-        sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
-        if (unpacked := sum(sizes[name] for name in names)) > MOST_BYTES:
-            raise UserError(f"unpacks to {unpacked} bytes, more than {MOST_BYTES}; use .npy, which is read in pieces")
-        try:
-            arrays = {name: np.asarray(archive[name]) for name in names}
-        except MemoryError:  # a header can declare any size
-            raise UserError("announces more than fits into the memory") from None
-    if others := [name for name in sizes if name not in names]:
-        report(f"arrays that are not used: {list_names(others)}")
-    if not arrays:
-        raise UserError(f"has none of the arrays {list_names([*(wanted or ())])}; found {', '.join(sizes) or 'none'}")
-    return arrays
-
-
-def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
-    """The columns of named arrays (points, c) or (points,), and of unnamed ones that are as long."""
-    columns: Columns = {}
-    if name := next((name for name in (*PLACES.split(), "arr0") if name in arrays), None):
-        table = np.atleast_2d(arrays.pop(name))
-        unnamed = [arrays.pop(other) for other in UNNAMED if other in arrays]
-        beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
-        table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
-        columns = dict(zip(plain_names(table, report), table.T, strict=True))
-        others = [other for other, x in arrays.items() if other in POSITION or np.size(x) <= SINGLE < len(table)]
-        if others:
-            report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
-        arrays = {other: x for other, x in arrays.items() if other not in others}
-    columns |= name_columns(arrays)
-    if len({len(column) for column in columns.values()}) > 1:
-        raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")
-    return columns

@@ -44,8 +44,8 @@ from PIL import Image
 from spnr_jax.config import Quality, SurfelConfig
 from spnr_jax.errors import UserError, require
 from spnr_jax.formats import images
+from spnr_jax.formats.array_files import pack_arrays
 from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
-from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer

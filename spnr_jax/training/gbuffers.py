@@ -30,10 +30,10 @@ from tqdm import tqdm
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import programs
 from spnr_jax.errors import UserError
+from spnr_jax.formats.array_files import pack_arrays, read_arrays
 from spnr_jax.formats.clouds import MOST_EVEN
 from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
-from spnr_jax.formats.point_tables import pack_arrays, read_arrays
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.cleaning import Cleaned, clean_columns
 from spnr_jax.kernels.cloud_arrays import farthest_points

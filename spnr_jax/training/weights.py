@@ -21,8 +21,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from spnr_jax.config import NetworkConfig, TrainConfig
 from spnr_jax.errors import UserError
+from spnr_jax.formats.array_files import pack_arrays, read_arrays
 from spnr_jax.formats.images import write_whole
-from spnr_jax.formats.point_tables import pack_arrays, read_arrays
 from spnr_jax.method.model import Model
 from spnr_jax.methods import UnknownMethod, from_dict, include, method_of, to_dict
 

@@ -7,8 +7,8 @@ import pytest
 from support.point_clouds import BALL, GREEN, LINEAR, SRGB, XYZRGB, ply_bytes, read, read_columns, write
 from support.point_tables import as_npy
 
+from spnr_jax.formats.array_files import pack_arrays
 from spnr_jax.formats.clouds import read_cloud
-from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.surfels.sides import spiral
 
 ROWS = [(*point, *GREEN) for point in BALL.tolist()]
@@ -21,6 +21,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 
 
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
+GREY_BALL = np.round(1000 * BALL + 1500).astype(int)
 BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY = [(*row[:3], -900, *GREEN) for row in ROWS]
 TIMED = [(17.5 + i / 1e3 + (i % 3) / 1e4, *row) for i, row in enumerate(ROWS)]
@@ -38,6 +39,8 @@ THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROW
 GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
 LOUD, V_NAMES = ply_bytes("ascii", rows=FLOATS, properties=XYZRGB).replace(b"float", b"Float"), "V1 V2 V3 V4 V5 V6\n"
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
+HASHED = [("#" * (i % 2) + str(i), *point) for i, point in enumerate(POINTS)]
+MILLIMETRES = "".join(",".join(f'"{x:,}"' for x in row) + "\n" for row in GREY_BALL.tolist())
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {
@@ -78,6 +81,14 @@ TEXTS = {
         "a.csv",
         "i,x,y,z,r,g,b\nP,null,1,1,1,2,3\n" + WORDY.split("\n", 1)[1],
     ),
+    "a label that is empty, then words": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,\n" + table(",", ",car")),
+    "names behind a word": ("a.txt", "# columns: b g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "names in brackets": ("a.txt", "# ['b', 'g', 'r', 'z', 'y', 'x']\n" + table(" ", columns=BACKWARDS)),
+    "names behind a semicolon": ("a.txt", "; b g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "words first, decimal commas": ("a.csv", WORDY.replace(",", ";").replace(".", ",")),
+    "words with blanks between tabs": ("a.tsv", "x\ty\tz\tr\tg\tb\tname\n" + table("\t", "\told chair")),
+    "a missing number between tabs": ("a.tsv", "x\ty\tz\tr\tg\tb\n" + table("\t") + "1\t\t1\t1\t2\t3\n"),
+    "Excel's missing values": ("a.csv", "x,y,z,r,g,b\n" + table(",") + "1,#N/A,1,1,2,3\n"),
     "a label that is a dash, then words": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,-\n" + table(",", ",car")),
     "names in any file, minus signs": ("a.prn", "  X Y Z R G B\n" + table("  ").replace("-", "\N{MINUS SIGN}")),
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
@@ -177,6 +188,23 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             "the 7 columns, which have no names, taken as x y z r g b scalar; r g b may",
         ),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
+        (
+            "a.csv",
+            "id,x,y,z\n" + table(",", columns=HASHED),
+            "210 rows that begin with a mark of remarks (# // %) are not read",
+        ),
+        (
+            "a.txt",
+            "# 1:z 2:y 3:x\n" + table(" ", columns=POINTS),
+            "lines that may name the columns in another order, and are",
+        ),
+        ("a.csv", "x,y,z,r,g,b,R\n" + table(",", ",0"), "names that occur twice, of which the first column is read: r"),
+        (
+            "a.csv",
+            "x,y,z,hex\n" + table(",", ",#28aa3c", columns=POINTS) + "1,2,3,none\n",
+            "1 of 421 colours are no #rrggbb",
+        ),
+        ("a.csv", MILLIMETRES, "whole numbers among small ones of three decimals in x, y, z: write thousands"),
         (
             "a.csv",
             "x,y,z,u,v\ntop left,,\nm,m,m,,\n" + GREYS,

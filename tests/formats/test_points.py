@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from support.point_clouds import BALL, GREEN, LINEAR, SRGB, XYZRGB, ply_bytes, read, write
 from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_npy, compress_lzf, written
 
-from spnr_jax.formats import clouds, las, point_tables, row_files
+from spnr_jax.formats import array_files, clouds, las, point_tables, row_files
+from spnr_jax.formats.array_files import pack_arrays
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.formats.point_files import column_pieces, kind_of
-from spnr_jax.formats.point_tables import pack_arrays
 from spnr_jax.formats.row_files import decompress
 
 PIECED = ("ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "a.xyz", "a.csv", "a.npy", "a.las")
@@ -42,7 +42,7 @@ def test_a_table_comes_back_with_its_colours_linear_without_broken_rows_and_not_
 @pytest.mark.parametrize("name", PIECED)
 def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatch):
     path = written(tmp_path, name, WHOLE)
-    limits = (row_files, "PIECE_LINES", 5), (point_tables, "PIECE_LINES", 5), (point_tables, "PIECE_BYTES", 5 * 35)
+    limits = (row_files, "PIECE_LINES", 5), (point_tables, "PIECE_LINES", 5), (array_files, "PIECE_BYTES", 5 * 35)
     for module, limit, size in limits:
         monkeypatch.setattr(module, limit, size)
     monkeypatch.setattr(row_files, "PIECE_BYTES", 5 * 31)

@@ -206,7 +206,7 @@ def test_the_error_of_an_image_is_the_mean_that_the_weights_ask_for_over_all_pix
     seen = jnp.arange(32).reshape(2, 1, 4, 4) % 5 == 0
     for weight, expected in (("l1_weight", np.abs(image - reference)), ("mse_weight", (image - reference) ** 2)):
         loss = dataclasses.replace(L1_ONLY.loss, **{"l1_weight": 0.0, "low_resolution_weight": 0.0, weight: 1.0})
-        error_of = partial(inference.reconstruction_loss, dataclasses.replace(L1_ONLY, loss=loss), image, None)
+        error_of = partial(inference.reconstruction_loss, dataclasses.replace(L1_ONLY, loss=loss), image, image)
         close(error_of(reference), expected.mean())
         close(error_of(reference, seen), expected[np.asarray(seen)].mean())
         assert error_of(reference, jnp.zeros_like(seen)) == 0

@@ -12,7 +12,7 @@ from flax.traverse_util import flatten_dict
 from support import tiny_surfels, tiny_untrained
 from support.laws import close
 
-from spnr_jax.formats.point_tables import pack_arrays
+from spnr_jax.formats.array_files import pack_arrays
 from spnr_jax.presets import PRESETS
 from spnr_jax.training import checkpoint, optimisation, weights
 
