@@ -70,12 +70,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
             wanted = "expected rows of numbers, with a line of names above them if they begin with words"
             raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
-        delimiter = next((mark for mark in ";," if mark in first[1]), None)
-        parts = first[1].split()
-        if first[1].count("\t") in {line.count("\t") for line in before} - {0, 1}:
-            delimiter = "\t"
-        elif delimiter == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts)):
-            delimiter = None  # these are decimal commas
+        delimiter = _find_delimiter(before, first[1])
         headers = {line for line in before if not NUMBER.match(line)}  # repeated where files were concatenated
         announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
 
@@ -108,10 +103,10 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             except UserError as error:
                 if names:
                     raise
-                broken = error  # unless the words stand in columns that are not used
-                columns = zip(*(text.split(delimiter) for _, text in rows), strict=False)
-                mostly = [i for i, fields in enumerate(columns) if np.mean([*map(_is_number, fields)]) < 0.5]
-                unread |= dict.fromkeys(mostly, _packed_color)
+                broken = error
+                columns = enumerate(zip(*(text.split(delimiter) for _, text in rows), strict=False))
+                words_in = [i for i, fields in columns if sum(map(_is_number, fields)) < len(fields) / 2]
+                unread |= dict.fromkeys(words_in, _packed_color)  # the first row need not have a word
                 table = load(rows)
             if not names:
                 names = _names(before, table, unread, path.suffix.lower(), report)
@@ -121,12 +116,9 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
                 hexadecimal = [i for i in unread if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
                 of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
                 names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
-                doubtful = [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]
-                if doubtful:
-                    where = ", ".join(doubtful)
-                    report(
-                        f"whole numbers among small ones of three decimals in {where}: write thousands without marks"
-                    )
+                if cut := [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]:
+                    numbers = "whole numbers among small ones of three decimals"
+                    report(f"{numbers} in {', '.join(cut)}: write thousands without marks")
             colorless += sum(int(np.isnan(table[:, i]).sum()) for i in unread if names[i] == "rgb")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         if announced and announced != found:
@@ -136,6 +128,15 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             report(f"{commented:,} rows that begin with a mark of remarks (# // %) are not read")
         if colorless:
             report(f"{colorless:,} of {found:,} colours are no #rrggbb, and taken as black")
+
+
+def _find_delimiter(before: list[str], row: str) -> str | None:
+    """What separates the numbers of a row: tabs if the line of names has as many; None for blanks."""
+    if row.count("\t") in {line.count("\t") for line in before} - {0, 1}:
+        return "\t"
+    mark, parts = next((mark for mark in ";," if mark in row), None), row.split()
+    decimal = mark == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts))
+    return None if decimal else mark
 
 
 def open_text(path: Path) -> TextIO:
@@ -179,10 +180,9 @@ def _is_commented_row(line: str, count: int) -> bool:
 def _are_cut(values: np.ndarray) -> bool:
     """Whether numbers (n,) look as if marks of thousands were taken for decimal ones: 1.987 among 705 and 12."""
     size = np.abs(values[np.isfinite(values)])
-    whole = size % 1 == 0
-    if not 0.05 < np.mean(whole) < 0.95:
+    whole, small = size % 1 == 0, size[size % 1 != 0]
+    if not 0.05 * len(size) < len(small) < 0.95 * len(size):
         return False
-    small = size[~whole]
     three = np.abs(1000 * small - np.round(1000 * small)).max() < 1e-6
     return bool(three and small.min() >= 1 and 10 * small.max() < size[whole].max())
 
