@@ -303,12 +303,12 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
         values["normals"] = directions
     elif set(NORMAL) <= columns.keys():
         report("normals of the file left out: none is a direction with a sign")
-    if sampled:
-        return Points(positions - origin, values, origin)
-    places, values, merged = cloud_arrays.merge_repeats(positions - origin, values)
-    if merged:
-        report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
-    cloud_arrays.require_surface(places, len(positions))
+    places = positions - origin
+    if not sampled:
+        places, values, merged = cloud_arrays.merge_repeats(places, values)
+        if merged:
+            report(f"{merged:,} of {len(positions):,} points repeat others, and were merged with them")
+        cloud_arrays.require_surface(places, len(positions))
     if len(places) < FEWEST:
         report(f"{len(places)} points alone tell next to no surface: the picture is a guess")
     return Points(places, values, origin)

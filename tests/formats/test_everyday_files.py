@@ -141,6 +141,7 @@ def test_libraries_of_materials_are_read_however_they_are_written(tmp_path):
         cloud, lines = read(write(tmp_path, "a.obj", PAINTED), num_points=9)
         np.testing.assert_allclose(cloud.base_color, np.full((9, 3), 0.25), atol=1e-6)
         assert any("Kd beyond 1" in line for line in lines) == ("63" in library)
+        assert "9 points alone tell next to no surface: the picture is a guess" in lines
 
 
 def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
