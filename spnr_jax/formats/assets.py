@@ -44,6 +44,7 @@ MOSTLY_OPAQUE = 0.5
 MOST_NAMES = 3  # in a message
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
+MOST_HELD = 2**28  # bytes of decoded images that may be asked for again
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
 CURVES: dict[str, np.ndarray] = {  # values of encoded texels; those of a normal map are components of directions
     "linear": LEVELS,
@@ -164,9 +165,11 @@ class Loading:
     def read_image(self, name: str, data: bytes | memoryview | None = None) -> "Texels | None":
         """The image of that name, of `data` or else of the file at this uri; None if it is missing or cannot be read.
 
-        It is decoded once.
+        It is decoded once, unless the images since then fill MOST_HELD bytes.
         """
         if name not in self._images:
+            if sum(image.encoded.nbytes for image in self._images.values() if image) > MOST_HELD:
+                self._images.clear()
             content = self.read(name) if data is None else bytes(data)
             self._images[name] = None if content is None else self._decode_image(content, name[:80])
         return self._images[name]
