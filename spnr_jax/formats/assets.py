@@ -20,7 +20,6 @@ import io
 import itertools
 import warnings
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import unquote, unquote_to_bytes
@@ -44,7 +43,7 @@ MOSTLY_OPAQUE = 0.5
 MOST_NAMES = 3  # in a message
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
-MOST_HELD = 2**28  # bytes of decoded images that may be asked for again
+MOST_HELD = 2**27  # bytes of decoded images that may be asked for again
 LEVELS = np.arange(256, dtype=np.float32) / 255  # of 8 bits
 CURVES: dict[str, np.ndarray] = {  # values of encoded texels; those of a normal map are components of directions
     "linear": LEVELS,
@@ -249,10 +248,14 @@ class Texels:
     """Encoded texels (h, w, 4) of an image; the values of channels are computed once for all materials that show it."""
 
     def __init__(self, encoded: np.ndarray):
-        self.encoded, self.values = encoded, cache(self._values)
+        self.encoded = encoded
+        self._decoded: dict[tuple, np.ndarray] = {}  # a functools.cache here would outlive the texels until gc runs
 
-    def _values(self, channels: int | tuple[int, ...], curve: str) -> np.ndarray:
-        return decode_texels(self.encoded[..., channels], CURVES[curve])
+    def values(self, channels: int | tuple[int, ...], curve: str) -> np.ndarray:
+        """Values (h, w) or (h, w, c) of channels by one of the CURVES."""
+        if (key := (channels, curve)) not in self._decoded:
+            self._decoded[key] = decode_texels(self.encoded[..., channels], CURVES[curve])
+        return self._decoded[key]
 
 
 def decode_image(data: bytes) -> np.ndarray:
