@@ -158,6 +158,8 @@ REFUSED = [
     ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found x"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 " * 6 + "\n", r"shape \(1, 18\)"),
+    ("a.csv", "x,y,z\n1,2,3\n(0.5),1,2\n4,5,7\n", r"line 3: expected 3 numbers, found '\(0.5\),1,2'"),
+    ("a.csv", "Northing,Easting,Height,Code\n1,2,3\n4,5,7\n", "names 4 columns .* above 3 columns of numbers"),
     ("a.xyz", "x y z\n1 2 3 4\n", "names 3 columns .* above 4"),
     ("a.csv", "x,y,z\n1,2m,3\n4,5,6\n", "line 2: expected 3 numbers, found '1,2m,3'"),
     ("a.csv", "x,y,z\n0,5,1,5,2,5\n", "names 3 columns .* above 6 .*; decimal commas need another separator"),
