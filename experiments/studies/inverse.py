@@ -185,7 +185,7 @@ def make_plan(params: dict, truths: Sequence[Truth]) -> Plan:
     """Sizes for all objects, with room for what moves."""
     scenes = stack([_encode(params, truth.cloud, truth.neighbors) for truth in truths])
     plan = spnr_jax.plan(scenes, stack([truth.camera for truth in truths]))
-    most = surfel_renderer.widest_window(truths[0].camera.width, plan.doublings, plan.side)
+    most = surfel_renderer.bound_window(truths[0].camera.width, plan.doublings, plan.side)
     width, height = (min(n + surfel_renderer.STEP, max(n, most)) for n in (plan.width, plan.height))
     entries, slots = int(ROOM * plan.entries), min(int(ROOM * plan.slots), width * height)
     return plan._replace(width=width, height=height, entries=entries, slots=slots)

@@ -36,7 +36,7 @@ from spnr_jax.formats.columns import (
     useful,
 )
 from spnr_jax.formats.orientation import ROTATIONS, find_up, holds_splats, sensor_of
-from spnr_jax.formats.plausibility import check_rounding, check_steps, check_values, without_no_data
+from spnr_jax.formats.plausibility import check_rounding, check_steps, check_values, drop_no_data
 from spnr_jax.formats.point_files import MESHES, column_pieces, kind_of, parse_ply
 from spnr_jax.formats.surface_points import SurfacePoints, bounding_box, sample_surface, vertex_points
 from spnr_jax.kernels import cloud_arrays, scenes
@@ -292,7 +292,7 @@ def _interpret(columns: Columns, sampled: bool, how: Reading) -> Points:
     """Interprets the columns; equal and nearly equal points are merged, unless they were sampled on a mesh."""
     report = how.report
     if not sampled:
-        columns = without_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
+        columns = drop_no_data(keep_visible(columns, how.cut.keep_noise, report), report)
     positions = stack_columns(columns)
     if not sampled:
         check_steps(positions, [columns[axis] for axis in "xyz"], report)

@@ -30,7 +30,7 @@ DEGREES, NEEDLE = 0.5, 100.0  # largest width in degrees; ratio of height to wid
 THIN = 0.1, 1.0  # thickness, in spacings, of a plate whose two sides cannot be told apart
 
 
-def without_no_data(columns: Columns, report: Report) -> Columns:
+def drop_no_data(columns: Columns, report: Report) -> Columns:
     """The points without those that mean "no data": many at 0 0 0 among others, or at a height of NO_DATA."""
     positions = stack_columns(columns)
     nowhere, low = np.asarray(~positions.any(axis=1)), np.isin(positions[:, 2], NO_DATA)

@@ -1,8 +1,8 @@
 """Tables of points in text (.xyz .txt .csv .asc .pts) as named columns, piece by piece; names of columns without any.
 
-Separators are commas, semicolons, bars or blanks, also at the end of a line.  A comma is a decimal one inside quotes,
-or if something else separates the numbers; 1.234,5 has a thousand.  Lines of a single integer are counts of points.  A
-header line, also one after #, % or //, names the columns; columns without a name, or of words, are not read.
+Separators are commas, semicolons, bars, tabs or blanks, also at the end of a line.  A comma is a decimal one inside
+quotes, or if something else separates the numbers; 1.234,5 has a thousand.  Lines of a single integer are counts of
+points.  A header line, also one after #, % or //, names the columns; columns without a name, or of words, are not read.
 Without a header the values decide what follows x y z: normals, r g b, alpha, roughness, metallic, intensity, others.
 """
 
@@ -49,15 +49,14 @@ COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of c
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = {mark: re.compile(rf"(?:^|(?<={mark}))[^\S{mark}]*(?={mark}|$)") for mark in ",;\t"}  # a missing number
-UNDEFINED = re.compile(
-    r"[+-]?(nan\([a-z]*\)|1\.#\w+)|#n/?a|#nv|\b(n/?a|null|none)\b", re.IGNORECASE
-)  # of C and databases
+# missing numbers of C, Excel and databases
+UNDEFINED = re.compile(r"[+-]?(nan\([a-z]*\)|1\.#\w+)|#n/?a|#nv|\b(n/?a|null|none)\b", re.IGNORECASE)
 DASH = re.compile(r"(?<![^\s,;])-(?![^\s,;])")  # a missing number, but in the first row
 FORTRAN = re.compile(r"(?<![#\w.])([+-]?(?:\d+(?:\.\d*)?|\.\d+))d(?=[+-]?\d)", re.IGNORECASE)  # exponents
 WHOLE = re.compile(r"(?<=\d)\.0+(?![\d.ed])", re.IGNORECASE)
 ONE_IN_BRACKETS = re.compile(r"[\[({][\d.,]+[])}]")  # accountants' negative numbers
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
-AROUND_NAMES = re.compile(r"^[^:=]*[:=]|[][(){}'\"]")
+AROUND_NAMES = re.compile(r"^[^:=]*[:=]|[][(){}'\"]")  # "columns: [x, y, z]"
 INDEX = "index"  # name of a column that is not used
 
 
@@ -93,20 +92,18 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
             return load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
 
         lines = rows_of_numbers()
+        broken = UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
         names: tuple[str, ...] = ()
         found, colorless = 0, 0
         while rows := list(islice(lines, PIECE_LINES)):
             found += len(rows)
-            broken = UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
             try:
                 table = load(rows)
             except UserError as error:
                 if names:
                     raise
                 broken = error
-                columns = enumerate(zip(*(text.split(delimiter) for _, text in rows), strict=False))
-                words_in = [i for i, fields in columns if sum(map(_is_number, fields)) < len(fields) / 2]
-                unread |= dict.fromkeys(words_in, _packed_color)  # the first row need not have a word
+                unread |= dict.fromkeys(_find_words(rows, delimiter), _packed_color)
                 table = load(rows)
             if not names:
                 names = _names(before, table, unread, path.suffix.lower(), report)
@@ -137,6 +134,12 @@ def _find_delimiter(before: list[str], row: str) -> str | None:
     mark, parts = next((mark for mark in ";," if mark in row), None), row.split()
     decimal = mark == "," and len(parts) > 2 and all(map(WITH_COMMA.fullmatch, parts))
     return None if decimal else mark
+
+
+def _find_words(rows: list[Line], delimiter: str | None) -> list[int]:
+    """The columns of which most fields are words, whatever the first row has there."""
+    columns = zip(*(text.split(delimiter) for _, text in rows), strict=False)
+    return [i for i, fields in enumerate(columns) if sum(map(_is_number, fields)) < len(fields) / 2]
 
 
 def open_text(path: Path) -> TextIO:
@@ -251,9 +254,9 @@ def _names(
     for line in reversed(before):
         remark = line.lstrip("#/%;! ")
         plain = UNITS.sub("", line if remark == line else _plain(remark))
-        names = _fields_of_names(plain, filled, count)
-        if line.startswith(COMMENTS) and not filled <= len(names) <= count:  # "columns: [x, y, z]"
-            names = _fields_of_names(AROUND_NAMES.sub(" ", plain).strip(" ,;"), filled, count)
+        names = _split_names(plain, filled, count)
+        if line.startswith(COMMENTS) and not filled <= len(names) <= count:
+            names = _split_names(AROUND_NAMES.sub(" ", plain).strip(" ,;"), filled, count)
         # V1, V2 ... of R and Matlab name nothing
         is_remark = line.startswith(COMMENTS) or NUMBER.match(line) or len({re.sub(r"\d", "", x) for x in names}) == 1
         if filled <= len(names) <= count and (name_places(names) or not is_remark):
@@ -283,7 +286,7 @@ def _names(
     return (*guessed, *[INDEX] * (count - filled))
 
 
-def _fields_of_names(text: str, filled: int, count: int) -> list[str]:
+def _split_names(text: str, filled: int, count: int) -> list[str]:
     """The names in a line, in lower case, for a table of `count` columns, of which the first `filled` hold numbers."""
     names = [name.lower() for name in _words(text)]
     if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks

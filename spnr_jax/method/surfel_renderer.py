@@ -230,7 +230,7 @@ def place_window(foot: Footprints) -> tuple[Int[Array, "2"], Int[Array, ""], Int
     return jnp.stack([left, top]), width, height
 
 
-def widest_window(pixels: int, doublings: int, side: int) -> int:
+def bound_window(pixels: int, doublings: int, side: int) -> int:
     """Pixels along a side of the window of an object that fills a picture of `pixels` pixels, or exceeds it."""
     return round_up(-(-pixels * side // 2**doublings) + 2 * BEYOND + MARGIN)
 

@@ -298,7 +298,7 @@ def make_plan(model: Model, num_points: int, size: int) -> Plan:
     ball = make_cloud(RADIUS * spiral(num_points), roughness=0.5)
     scene = surfel_method.encode_in_box(ball)
     plan = surfel_renderer.plan(scene, model.camera(scene, resolution=size))
-    window = surfel_renderer.widest_window(size, plan.doublings, plan.side)
+    window = surfel_renderer.bound_window(size, plan.doublings, plan.side)
     return plan._replace(width=window, height=window, entries=2 * plan.entries, slots=window**2)
 
 

@@ -21,7 +21,7 @@ def table(separator: str, end: str = "", comma: bool = False, columns=ROWS) -> s
 
 
 INDEXED, PCV = [(i, *row) for i, row in enumerate(ROWS)], [(*row, 0.5) for row in ROWS]
-GREY_BALL = np.round(1000 * BALL + 1500).astype(int)
+BALL_IN_MILLIMETRES = np.round(1000 * BALL + 1500).astype(int)
 BACKWARDS = [row[::-1] for row in ROWS]
 WITH_INTENSITY = [(*row[:3], -900, *GREEN) for row in ROWS]
 TIMED = [(17.5 + i / 1e3 + (i % 3) / 1e4, *row) for i, row in enumerate(ROWS)]
@@ -40,7 +40,7 @@ GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
 LOUD, V_NAMES = ply_bytes("ascii", rows=FLOATS, properties=XYZRGB).replace(b"float", b"Float"), "V1 V2 V3 V4 V5 V6\n"
 GREYS = table(",", columns=[(*point, 0, 0) for point in POINTS])
 HASHED = [("#" * (i % 2) + str(i), *point) for i, point in enumerate(POINTS)]
-MILLIMETRES = "".join(",".join(f'"{x:,}"' for x in row) + "\n" for row in GREY_BALL.tolist())
+MILLIMETRES = "".join(",".join(f'"{x:,}"' for x in row) + "\n" for row in BALL_IN_MILLIMETRES.tolist())
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 TEXTS = {

@@ -182,7 +182,7 @@ def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scen
     for spacing, away in itertools.product((0.02, 0.1, 0.4), (0.9, 2.0, 3.0)):
         other = scene.replace(spacing=jnp.float32(spacing))
         plan = surfel_renderer.plan(other, camera(size, (0.0, 0.0, away)))
-        widest = surfel_renderer.widest_window(size, plan.doublings, plan.side)
+        widest = surfel_renderer.bound_window(size, plan.doublings, plan.side)
         assert max(plan.width, plan.height) <= widest
         assert away > 1 or plan.doublings or plan.width == widest
 
