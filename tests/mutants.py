@@ -106,6 +106,8 @@ def check_unbroken(tests: Sequence[str]) -> None:
 def main(words: Sequence[str], jobs: int) -> int:
     """Run the mutants whose name holds one of the words (or all); the number that was not caught."""
     chosen = [mutant for mutant in read_table() if not words or any(word in mutant.name for word in words)]
+    if not chosen:
+        raise SystemExit(f"no mutant is named by {' or '.join(words)}; see {TABLE.name}")
     print(f"{len(chosen)} mutants; first the tests without any", flush=True)
     check_unbroken(sorted({test for mutant in chosen for test in mutant.tests}))
     missed = 0

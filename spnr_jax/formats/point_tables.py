@@ -8,11 +8,11 @@ Without a header the values decide what follows x y z: normals, r g b, alpha, ro
 
 import contextlib
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
@@ -60,71 +60,103 @@ AROUND_NAMES = re.compile(r"^[^:=]*[:=]|[][(){}'\"]")  # "columns: [x, y, z]"
 INDEX = "index"  # name of a column that is not used
 
 
+class Head(NamedTuple):
+    """The lines above the rows of numbers, the first row, and how its fields are separated."""
+
+    before: list[str]
+    first: Line
+    delimiter: str | None  # None for blanks
+    fields: list[str]
+
+
 def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
     """The columns of a text file, some points at a time; a line above the numbers may name them."""
     with open_text(path) as file:
         numbered = ((number, _plain(line)) for number, line in enumerate(file, 1))
-        before, first = _split_header(numbered)
-        if not first[1]:
-            remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
-            wanted = "expected rows of numbers, with a line of names above them if they begin with words"
-            raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
-        delimiter = _find_delimiter(before, first[1])
-        headers = {line for line in before if not NUMBER.match(line)}  # repeated where files were concatenated
-        announced = max((int(line[:SHOWN].split()[0]) for line in before if COUNT.fullmatch(line[:SHOWN])), default=0)
-
-        words = [word.replace(",", ".") for word in first[1].split(delimiter)]
-        unread = {i: _packed_color for i, word in enumerate(words) if not _is_number(word)}
-        commented = sum(_is_commented_row(line, len(words)) for line in before)
-
-        def rows_of_numbers() -> Iterator[Line]:
-            nonlocal announced, commented
-            for number, text in chain([first], numbered):
-                if text.isdecimal():
-                    announced += int(text[:SHOWN])
-                elif text.startswith(COMMENTS):
-                    commented += _is_commented_row(text, len(words))
-                elif text and text not in headers:
-                    text = EMPTY[delimiter].sub("nan", text) if delimiter else text
-                    yield number, text if delimiter == "," else text.replace(",", ".")
-
-        def load(rows: list[Line]) -> np.ndarray:
-            return load_text(rows, "line", len(words), delimiter, ndmin=2, converters=unread)
-
-        lines = rows_of_numbers()
-        broken = UserError(f"line {first[0]}: expected {len(words)} numbers, found {first[1][:SHOWN]!r}")
+        head, counted = _read_head(numbered), Counter[str]()
+        lines = _rows_of_numbers(head, numbered, counted)
+        words = {i for i, field in enumerate(head.fields) if not _is_number(field)}  # columns that are not numbers
+        number, row = head.first
+        broken = UserError(f"line {number}: expected {len(head.fields)} numbers, found {row[:SHOWN]!r}")
         names: tuple[str, ...] = ()
-        found, colorless = 0, 0
         while rows := list(islice(lines, PIECE_LINES)):
-            found += len(rows)
+            counted["points"] += len(rows)
             try:
-                table = load(rows)
+                table = _load_table(rows, head, words)
             except UserError as error:
                 if names:
                     raise
-                broken = error
-                unread |= dict.fromkeys(_find_words(rows, delimiter), _packed_color)
-                table = load(rows)
+                broken, words = error, words | _find_words(rows, head.delimiter)
+                table = _load_table(rows, head, words)
             if not names:
-                names = _names(before, table, unread, path.suffix.lower(), report)
-                if {names[i] for i in unread} & {*"xyz", *COLOR}:
+                names = _names(head.before, table, words, path.suffix.lower(), report)
+                if {names[i] for i in words} & {*POSITION, *COLOR}:
                     raise broken
-                of_words = {i: f"{names[i]} (words)" for i in unread}
-                hexadecimal = [i for i in unread if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
-                of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
-                names = tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
-                if cut := [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]:
-                    numbers = "whole numbers among small ones of three decimals"
-                    report(f"{numbers} in {', '.join(cut)}: write thousands without marks")
-            colorless += sum(int(np.isnan(table[:, i]).sum()) for i in unread if names[i] == "rgb")
+                names = _name_words(names, table, words)
+                _report_cut_numbers(names, table, report)
+            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgb")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
-        if announced and announced != found:
-            end = ": is the file cut off?" if announced > found else ""
-            report(f"a line of the file announces {announced:,} points, {found:,} are there{end}")
-        if commented:
-            report(f"{commented:,} rows that begin with a mark of remarks (# // %) are not read")
-        if colorless:
-            report(f"{colorless:,} of {found:,} colours are no #rrggbb, and taken as black")
+        _report_counts(counted, report)
+
+
+def _read_head(lines: Iterator[Line]) -> Head:
+    """What stands above the numbers, and the first row of them; UserError if there is none."""
+    before, first = _split_header(lines)
+    if not first[1]:
+        remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
+        wanted = "expected rows of numbers, with a line of names above them if they begin with words"
+        raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
+    delimiter = _find_delimiter(before, first[1])
+    return Head(before, first, delimiter, [field.replace(",", ".") for field in first[1].split(delimiter)])
+
+
+def _rows_of_numbers(head: Head, lines: Iterator[Line], counted: Counter[str]) -> Iterator[Line]:
+    """The rows in a form that NumPy reads; counts what the file announces, and rows that are commented out."""
+    names = {line for line in head.before if not NUMBER.match(line)}  # repeated where files were concatenated
+    counts = (int(line[:SHOWN].split()[0]) for line in head.before if COUNT.fullmatch(line[:SHOWN]))
+    counted["announced"] = max(counts, default=0)
+    counted["commented"] = sum(_is_commented_row(line, len(head.fields)) for line in head.before)
+    for number, text in chain([head.first], lines):
+        if text.isdecimal():
+            counted["announced"] += int(text[:SHOWN])
+        elif text.startswith(COMMENTS):
+            counted["commented"] += _is_commented_row(text, len(head.fields))
+        elif text and text not in names:
+            text = EMPTY[head.delimiter].sub("nan", text) if head.delimiter else text
+            yield number, text if head.delimiter == "," else text.replace(",", ".")
+
+
+def _load_table(rows: list[Line], head: Head, words: Collection[int]) -> np.ndarray:
+    """The numbers of rows (points, columns); in columns of words, colours as numbers, else NaN."""
+    converters = dict.fromkeys(words, _packed_color)
+    return load_text(rows, "line", len(head.fields), head.delimiter, ndmin=2, converters=converters)
+
+
+def _name_words(names: tuple[str, ...], table: np.ndarray, words: Collection[int]) -> tuple[str, ...]:
+    """The names with those of columns of words marked; the first that holds colours is `rgb`."""
+    of_words = {i: f"{names[i]} (words)" for i in words}
+    hexadecimal = [i for i in sorted(words) if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
+    of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
+    return tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
+
+
+def _report_cut_numbers(names: Sequence[str], table: np.ndarray, report: Report) -> None:
+    """Reports positions that look as if marks of thousands were taken for decimal ones: 1.987 among 705 and 12."""
+    if cut := [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]:
+        numbers = "whole numbers among small ones of three decimals"
+        report(f"{numbers} in {', '.join(cut)}: write thousands without marks")
+
+
+def _report_counts(counted: Counter[str], report: Report) -> None:
+    """Reports rows and colours that are missing or not read."""
+    points, announced = counted["points"], counted["announced"]
+    if announced and announced != points:
+        end = ": is the file cut off?" if announced > points else ""
+        report(f"a line of the file announces {announced:,} points, {points:,} are there{end}")
+    if counted["commented"]:
+        report(f"{counted['commented']:,} rows that begin with a mark of remarks (# // %) are not read")
+    if counted["colorless"]:
+        report(f"{counted['colorless']:,} of {points:,} colours are no #rrggbb, and taken as black")
 
 
 def _find_delimiter(before: list[str], row: str) -> str | None:
@@ -136,10 +168,10 @@ def _find_delimiter(before: list[str], row: str) -> str | None:
     return None if decimal else mark
 
 
-def _find_words(rows: list[Line], delimiter: str | None) -> list[int]:
+def _find_words(rows: list[Line], delimiter: str | None) -> set[int]:
     """The columns of which most fields are words, whatever the first row has there."""
     columns = zip(*(text.split(delimiter) for _, text in rows), strict=False)
-    return [i for i, fields in enumerate(columns) if sum(map(_is_number, fields)) < len(fields) / 2]
+    return {i for i, fields in enumerate(columns) if sum(map(_is_number, fields)) < len(fields) / 2}
 
 
 def open_text(path: Path) -> TextIO:
