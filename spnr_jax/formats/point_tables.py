@@ -75,22 +75,21 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         numbered = ((number, _plain(line)) for number, line in enumerate(file, 1))
         head, counted = _read_head(numbered), Counter[str]()
         lines = _rows_of_numbers(head, numbered, counted)
-        words = {i for i, field in enumerate(head.fields) if not _is_number(field)}  # columns that are not numbers
-        number, row = head.first
-        broken = UserError(f"line {number}: expected {len(head.fields)} numbers, found {row[:SHOWN]!r}")
+        words: set[int] = set()  # columns of words
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
             counted["points"] += len(rows)
+            broken: UserError | None = None
             try:
                 table = _load_table(rows, head, words)
             except UserError as error:
                 if names:
                     raise
-                broken, words = error, words | _find_words(rows, head.delimiter)
+                broken, words = error, _find_words(rows, head.delimiter)
                 table = _load_table(rows, head, words)
             if not names:
                 names = _names(head.before, table, words, path.suffix.lower(), report)
-                if {names[i] for i in words} & {*POSITION, *COLOR}:
+                if broken and {names[i] for i in words} & {*POSITION, *COLOR}:
                     raise broken
                 names = _name_words(names, table, words)
                 _report_cut_numbers(names, table, report)
