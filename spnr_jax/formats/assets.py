@@ -15,10 +15,12 @@ replaced by plain values, and transparency becomes surface or nothing:
 """
 
 import base64
+import contextlib
 import importlib
 import io
 import itertools
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +43,8 @@ CHANNELS = {"base_color": 1, "roughness": 0, "metallic": 0, "opacity": 0, "norma
 BARELY_VISIBLE = 0.1  # alpha, as a share of the texture's maximum, below which a texel is empty
 MOSTLY_OPAQUE = 0.5
 MOST_NAMES = 3  # in a message
+TEXTURES = "textures"  # Sketchfab's downloads have it beside the folder of the mesh
+CODE_PAGES = ("cp1252", "cp1251", "gbk", "shift_jis")  # of names in older files
 MAX_SIZE = 1024
 MOST_PIXELS = 2**26  # of an image file: 8192 x 8192
 MOST_HELD = 2**27  # bytes of decoded images that may be asked for again
@@ -143,20 +147,24 @@ class Loading:
         """Bytes of the file at `uri` (percent escapes as in glTF), or of a data URI; None if it is missing.
 
         Looks in the mesh's folder, then in those above it up to `root`, for the longest suffix of the path that exists,
-        ignoring letter case.  So absolute paths of another machine still work, and nothing outside `root` is read.
-        UserError for a missing file if it is `needed` or the reading is strict.
+        ignoring letter case; then in a folder `textures` in or beside the mesh's.  So absolute paths of another machine
+        still work, and nothing else outside `root` is read.  UserError for a missing file if it is `needed` or the
+        reading is strict.
         """
         if uri.startswith("data:"):
             head, _, payload = uri.partition(",")
             with refusing("holds a data URI that is not base64"):
                 data = unquote_to_bytes(payload)
                 return base64.b64decode(payload, validate=True) if head.endswith(";base64") else data
-        names = dict.fromkeys(text.replace("\\", "/") for text in (uri, unquote(uri)))
-        folders = [x for x in (self.folder, *self.folder.parents) if x.is_relative_to(self.root)]
-        for name, folder in itertools.product(names, folders):
+        names = dict.fromkeys(text.replace("\\", "/") for x in (uri, unquote(uri)) for text in _readings(x))
+        folders: list[tuple[Path, list[str]]] = [
+            (x, []) for x in (self.folder, *self.folder.parents) if x.is_relative_to(self.root)
+        ]
+        folders += [(x, [TEXTURES]) for x in (self.folder, self.folder.absolute().parent)]
+        for (folder, below), name in itertools.product(folders, names):
             parts = [part for part in name.split("/") if part not in ("", ".")]
             for start in range(len(parts)):
-                if place := _find(folder, parts[start:]):
+                if place := _find(folder, [*below, *parts[start:]]):
                     return place.read_bytes()
         self.go_on_without("names a file that is missing", repr(unquote(uri)), needed)
         return None
@@ -170,7 +178,7 @@ class Loading:
             if sum(image.encoded.nbytes for image in self._images.values() if image) > MOST_HELD:
                 self._images.clear()
             content = self.read(name) if data is None else bytes(data)
-            self._images[name] = None if content is None else self._decode_image(content, name[:80])
+            self._images[name] = None if content is None else self._decode_image(content, _printable(name[:80]))
         return self._images[name]
 
     def _decode_image(self, content: bytes, name: str) -> "Texels | None":
@@ -228,6 +236,20 @@ class Loading:
         if surface.all() or not surface.any():
             return material if surface.any() else None
         return replace(material, opacity=alpha.astype(np.float32), cutoff=limit)
+
+
+def _readings(name: str) -> Iterator[str]:
+    """A name as it is and, if its bytes are no UTF-8, as other code pages have it."""
+    yield name
+    if _printable(name) != name:
+        for page in CODE_PAGES:
+            with contextlib.suppress(UnicodeDecodeError):
+                yield name.encode("utf-8", "surrogateescape").decode(page)
+
+
+def _printable(name: str) -> str:
+    """The name with question marks for bytes that are no UTF-8."""
+    return name.encode("utf-8", "replace").decode()
 
 
 def _find(folder: Path, names: list[str]) -> Path | None:

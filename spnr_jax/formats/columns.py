@@ -37,7 +37,7 @@ SILENT = re.compile(
 )
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
 PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
-PLACES += " pointcloud cloud xyzrgb data location pointsmxyz p"
+PLACES += " pointcloud cloud xyzrgb data location pointsmxyz worldpoints p"
 PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
 HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "hhe", "hoehe", "cota")  # hhe: Höhe
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
@@ -64,7 +64,7 @@ WORDS = ((POSITION, "x y z"), (SRGB, "r g b"), (SRGB, "red green blue"))
 OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera")
 NAMES = {name for group in ALIASES.values() for names in group for name in names}
 ARRAYS = {name.removesuffix("0") for name in NAMES}
-OF_SPLATS = ("f_dc_", "f_rest_", "scale_", "rot_")  # prefixes
+UNSAID = ("f_dc_", "f_rest_", "scale_", "rot_", "_")  # beginnings of the names of splats' columns, and of padding
 SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
@@ -144,9 +144,9 @@ def useful(columns: Columns) -> Columns:
 
 
 def describe_use(columns: Columns) -> list[str]:
-    """Lines about columns that are not used (except those of splats), and about names that were guessed."""
+    """Lines about columns that are not used (not those of splats and padding), and about names that were guessed."""
     used = {id(x): ours for ours, x in rename(columns).items()}
-    left = [name for name, x in columns.items() if id(x) not in used and not name.startswith(OF_SPLATS)]
+    left = [name for name, x in columns.items() if id(x) not in used and not name.startswith(UNSAID)]
     new = [name for name, x in columns.items() if id(x) in used and plain_name(name) not in NAMES]
     guessed = [f"{name} as {used[id(columns[name])]}" for name in new]
     lines = {"columns that are not used": left, "columns taken by a word of their names": guessed}
@@ -198,8 +198,8 @@ def invisible(columns: Columns) -> np.ndarray:
     name = next((name for name in ("splat_opacity", "alpha", "opacity") if name in columns), "")
     values, of_splats = columns.get(name, np.zeros(len(columns["x"]))), name == "splat_opacity"
     low, high = (float(end(initial=0)) for end in (values.min, values.max))
-    # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes
-    if name != "alpha" and (low < 0 or (of_splats and 1 < high <= LARGEST_LOGIT)):
+    # logits, as Kerbl et al. write them, unless all are 0 to 1, or bytes; an opacity of 1 has an infinite one
+    if name != "alpha" and (low < 0 or (of_splats and high > 1 and (high <= LARGEST_LOGIT or (values % 1 != 0).any()))):
         return values < np.log(FOG / (1 - FOG))
     # packed colours have an alpha of 0 if none was written
     white = full_scale(values.dtype, max(1.0, high), high < 2) if high > 0 else -np.inf

@@ -131,7 +131,11 @@ def spz_columns(path: Path) -> Columns:
     """The columns of a .spz file of version 2 or 3; ValueError for others."""
     content = path.read_bytes()
     with refusing("is a broken .spz file"):
-        content = content if content[:4] == MAGIC else zlib.decompressobj(wbits=31).decompress(content, MOST_BYTES)
+        if content[:4] != MAGIC:
+            packed = zlib.decompressobj(wbits=31)
+            content = packed.decompress(content, MOST_BYTES)
+            if not packed.eof:
+                raise UserError(f"is cut off, or larger than {MOST_BYTES:,} bytes")
     if content[:4] != MAGIC or len(content) < HEAD:
         raise UserError("is not an .spz file, or its header is cut off")
     version, count, bits = struct.unpack_from("<4x2IxB", content)

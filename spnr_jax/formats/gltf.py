@@ -70,6 +70,9 @@ def load_gltf(path: Path, loading: Loading) -> list[Part]:
         if not (mode := modes[id(primitive)]).startswith(wanted):
             ignored.add(f"{mode} primitives")
             continue
+        if "POSITION" not in primitive["attributes"]:
+            ignored.add("primitives without positions")
+            continue
         extensions = primitive.get("extensions", {})
         if SPLATS in extensions:
             raise UserError(f"holds Gaussian splats ({SPLATS}), which are not read: convert it to .ply or .spz")

@@ -33,7 +33,7 @@ class GltfFile:
         self.loading, data = loading, path.read_bytes()
         text, self._binary = _split_glb(data) if data[:4] == b"glTF" else (data, None)
         try:
-            self.document = json.loads(text.decode("utf-8-sig"))
+            self.document = json.loads(text.decode("utf-8-sig").rstrip("\0"))  # padding of old exporters
         except ValueError as error:
             raise UserError(f"its glTF header is not JSON, or truncated: {error}") from None
         version = str(self.document.get("asset", {}).get("version", "1.0"))

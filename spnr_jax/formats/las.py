@@ -51,6 +51,10 @@ def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
                 yield columns | name_columns({name: np.asarray(points[name]) for name in names})
+    except UserError as error:
+        if not isinstance(error.__cause__, UnicodeDecodeError):
+            raise
+        raise UserError("has extra bytes whose names are not in UTF-8: export it without them") from None
     except BaseException as error:  # a panic in lazrs, a Rust library, is no Exception
         if type(error).__name__ != "PanicException":
             raise

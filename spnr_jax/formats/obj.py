@@ -22,7 +22,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import assets
 from spnr_jax.formats.assets import RGB, Loading, Material, Part, Texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, full_scale
-from spnr_jax.formats.point_tables import load_text, open_text
+from spnr_jax.formats.point_tables import decode_text, load_text
 from spnr_jax.formats.polygons import colored_part
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import triangulate
@@ -44,8 +44,9 @@ OPTION = re.compile(
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
     """The file's faces grouped by material."""
-    with open_text(path) as file:
-        text = _parse(file.read())
+    text = _parse(decode_text(path.read_bytes()))
+    if text["l"]:
+        loading.ignored.add("lines")
     if text["surf"] and not text["f sizes"]:
         raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
     columns = _columns(text, loading)
@@ -61,7 +62,9 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     looks: dict[str, Look] = {}
     for name in dict.fromkeys(text["usemtl"]):
         look, move = _look(name, library.get(name), loading) if name else (make_material(), UNMOVED)
-        if colors is not None and look is not None and np.ptp(look.base_color) == 0 and look.base_color.ndim == 1:
+        if colors is not None and look is not None and look.base_color.ndim > 1:
+            loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
+        elif colors is not None and look is not None and np.ptp(look.base_color) == 0:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
             look = replace(look, base_color=np.ones(3, np.float32))  # Kd is a placeholder
         elif colors is not None and look is not None:
@@ -70,8 +73,6 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     parts = _parts(text, stack_columns(columns), colors, looks, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
-    if text["l"]:
-        loading.ignored.add("lines")
     if text["vn"] and any(part.normals is None for part in parts):
         loading.ignored.add("normals that only some faces have (flat shading is used)")
     return parts
@@ -82,7 +83,7 @@ def _parse(content: str) -> Rests:
     keywords = ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf", POLYPAINT)
     found: Rests = {keyword: [] for keyword in keywords}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
-    for line in content.replace("\\\n", " ").splitlines():
+    for line in re.sub(r"\\[ \t]*\r?\n", " ", content).splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword == "f":
             words = rest.partition("#")[0].split()
@@ -164,7 +165,8 @@ def _parts(
     for code in np.unique(kind):
         material, move = list(looks.values())[code // 4]
         assert material is not None
-        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
+        own = colors if material.base_color.ndim == 1 else None
+        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=own)
         placed = moved(move) if code & 2 else None
         parts.append(replace(part, normals=normals if code & 1 else None, texcoords=placed))
     return parts
@@ -189,7 +191,7 @@ def parse_mtl(data: bytes) -> dict[str, dict[str, str]]:
     """
     library: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
-    text = data.decode("utf-8-sig", "replace")
+    text = decode_text(data)
     blender = SHININESS.match(text)
     shiniest = blender and (900 if blender[1] else 1000)
     for line in text.splitlines():
@@ -210,7 +212,7 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
         loading.go_on_without("uses a material that no library defines", repr(name))
         return make_material(), UNMOVED
     if loading.strict:  # transparency is a clearer error than a missing file
-        loading.cut_out(name, make_material(), *_alpha(entry, None))
+        loading.cut_out(name, make_material(), *_alpha(entry, None, loading))
     maps: dict[str, Texels] = {}
     move = UNMOVED
     wrap: assets.Wrap = "repeat"
@@ -228,7 +230,7 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
             maps[key] = texels
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
-    color = np.array([float(x) for x in entry.get("kd", "0.5").split()[:3]])  # one number is grey
+    color = np.array(_numbers(entry, "kd", 0.5, loading)[:3])  # one number is grey
     white = full_scale(color.dtype, float(color.max()), linear=bool(color.max() < 2))
     if white > 1:
         ignored.add(f"MTL Kd beyond 1 (taken as 0 to {white:g})")
@@ -237,17 +239,26 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
         color = maps["map_kd"].values(RGB, "sRGB")
-    shiny, highlight = 0.5, max(float(entry.get("ns", 0)), 0)
+    shiny, highlight = 0.5, max(_numbers(entry, "ns", 0.0, loading)[0], 0)
     if "ns" in entry and "blender" in entry:
         shiny = 1 - min(highlight / float(entry["blender"]), 1) ** 0.5
     elif "ns" in entry and entry.get("illum") not in ("0", "1") and entry.get("ks", "1").strip("0. "):
         shiny = (2 / (highlight + 2)) ** 0.5
     roughness, metallic = (
-        maps[f"map_{key}"].values(0, "linear") if f"map_{key}" in maps else float(entry.get(key, plain))
-        for key, plain in (("pr", shiny), ("pm", 0))
+        maps[f"map_{key}"].values(0, "linear") if f"map_{key}" in maps else _numbers(entry, key, plain, loading)[0]
+        for key, plain in (("pr", shiny), ("pm", 0.0))
     )
     material = make_material(color, roughness, metallic, wrap)
-    return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d"))), move
+    return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d"), loading)), move
+
+
+def _numbers(entry: dict[str, str], key: str, default: float, loading: Loading) -> list[float]:
+    """The numbers of a statement, also with decimal commas; the default if there is none, or if it cannot be read."""
+    try:
+        return [float(word) for word in entry.get(key, "").replace(",", ".").split()] or [default]
+    except ValueError:
+        loading.go_on_without("has a number in its MTL that cannot be read", repr(f"{key} {entry[key]}"))
+        return [default]
 
 
 def _pair(words: Sequence[str], default: float) -> tuple[float, float]:
@@ -256,7 +267,7 @@ def _pair(words: Sequence[str], default: float) -> tuple[float, float]:
     return one, two
 
 
-def _alpha(entry: dict[str, str], map_d: Texels | None) -> tuple[str, np.ndarray, float | int | None]:
+def _alpha(entry: dict[str, str], map_d: Texels | None, loading: Loading) -> tuple[str, np.ndarray, float | int | None]:
     """The statement that makes an entry transparent ("": opaque), its alpha () or (h, w), and a mask's cut-off."""
     if "map_d" in entry:
         if map_d is None:
@@ -266,8 +277,9 @@ def _alpha(entry: dict[str, str], map_d: Texels | None) -> tuple[str, np.ndarray
         own = entry["map_d"] != entry.get("map_kd") and np.ptp(encoded[..., :3], axis=-1).max() <= NEARLY_GREY
         alpha = map_d.values(0 if own and encoded[..., 3].min() == 255 else 3, "linear")
         return "map_d", alpha, assets.MOSTLY_OPAQUE
-    if "d" in entry and (opacity := float(entry["d"].split()[-1])) < 1:
+    opaque = {"d": re.sub("-halo", "", entry.get("d", "")), "tr": entry.get("tr", "")}
+    if (opacity := _numbers(opaque, "d", 1.0, loading)[0]) < 1:
         return f"d {opacity:g}", np.asarray(opacity), None
-    if "tr" in entry and 0 < (share := float(entry["tr"].split()[-1])) < 1:
+    if 0 < (share := _numbers(opaque, "tr", 0.0, loading)[0]) < 1:
         return f"Tr {share:g}", np.asarray(1 - share), None
     return "", np.ones(()), None

@@ -180,6 +180,12 @@ def open_text(path: Path) -> TextIO:
     return path.open(encoding=encoding, errors="replace")
 
 
+def decode_text(data: bytes) -> str:
+    """The text of a file in UTF-8 or UTF-16; bytes of another code page become surrogates, so names stay apart."""
+    encoding = encoding_of(data[:2])
+    return data.decode(encoding, "surrogateescape" if encoding.startswith("utf-8") else "replace")
+
+
 def encoding_of(head: bytes) -> str:
     """The encoding of text with these first bytes."""
     if 0 in head[:2]:
@@ -267,7 +273,8 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
         try:
             load([plain])
         except ValueError:
-            raise UserError(f"{what} {number}: expected {count} numbers, found {text[:SHOWN]!r}") from None
+            typed = " of the header's types" if "dtype" in layout and len(plain.split()) == count else ""
+            raise UserError(f"{what} {number}: expected {count} numbers{typed}, found {text[:SHOWN]!r}") from None
     raise UserError(f"{what} {rows[0][0]}: expected {count} numbers in each row")
 
 

@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.assets import RGB, Loading, Part, make_material
+from spnr_jax.formats.assets import RGB, Loading, Part, Texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.row_files import Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
+PARTS_OF_PLY = {f"PLY element {name}" for name in ("vertex", "face", "tristrips")}
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(?:((?:ST|C|N)*)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
@@ -42,13 +43,25 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
         corners = strip_faces(np.insert(corners.astype(np.int64), np.cumsum(sizes), -1)).ravel()
         sizes, of_faces = np.full(len(corners) // 3, 3), {}
     texcoords = _texcoords(vertices, lists, corners, sizes)
+    _note_loose(corners, len(vertices["x"]), loading)
+    loading.ignored |= {f"PLY element {name:.40}" for name, count, _ in header.elements if count} - PARTS_OF_PLY
     images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
-    if texcoords is not None and images and all(image is not None for image in images):
-        return _textured(useful(vertices), corners, sizes, texcoords, of_faces.get("texnumber"), images)
-    textured = header.textures or any("texture" in name for name, *_ in header.elements)
-    if texcoords is not None or "texcoord" in lists or textured:
-        loading.ignored.add("texture coordinates")
-    return colored_part(vertices, corners, sizes, of_faces, loading)
+    if texcoords is None or not any(images):
+        textured = header.textures or any("texture" in name for name, *_ in header.elements)
+        if texcoords is not None or "texcoord" in lists or textured:
+            loading.ignored.add("texture coordinates")
+        return colored_part(vertices, corners, sizes, of_faces, loading)
+    number = np.asarray(of_faces.get("texnumber", np.zeros(len(sizes))))
+    wanted = [(image, number == i) for i, image in enumerate(images) if image is not None]
+    parts = [
+        _textured(useful(vertices), corners[np.repeat(own, sizes)], sizes[own], texcoords[np.repeat(own, sizes)], image)
+        for image, own in wanted
+    ]
+    if (rest := ~np.any([own for _, own in wanted], axis=0)).any():
+        loading.say(f"{rest.sum():,} of {len(rest):,} faces show no image of the file: their own colours taken")
+        left = {name: column[rest] for name, column in of_faces.items()}
+        parts += colored_part(vertices, corners[np.repeat(rest, sizes)], sizes[rest], left, loading)
+    return parts
 
 
 def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray | None:
@@ -61,29 +74,19 @@ def _texcoords(vertices: Columns, lists: Lists, corners: np.ndarray, sizes: np.n
     return np.stack(known[:2], axis=-1)[corners] if known and inside else None
 
 
-def _textured(
-    vertices: Columns,
-    corners: np.ndarray,
-    sizes: np.ndarray,
-    texcoords: np.ndarray,
-    number: np.ndarray | None,
-    images: list,
-) -> list[Part]:
-    """One part per image, of polygons with `sizes` corners each; texture coordinates (corners, 2).
-
-    `number`: the image of each polygon, or None for the first.
-    """
+def _textured(vertices: Columns, corners: np.ndarray, sizes: np.ndarray, texcoords: np.ndarray, image: Texels) -> Part:
+    """The part of polygons with `sizes` corners each that show an image; texture coordinates (corners, 2)."""
     positions = stack_columns(vertices)[corners]
     normals = stack_columns(vertices, NORMAL)[corners] if set(NORMAL) <= vertices.keys() else None
-    faces, owner = triangulate(positions, np.arange(len(positions)), sizes)
-    number = np.zeros(len(owner)) if number is None else number[owner]
-    texcoords = texcoords * [1, -1] + [0, 1]
-    parts = []
-    for i, image in enumerate(images):
-        material = make_material(image.values(RGB, "sRGB"))
-        own = faces[number == i]
-        parts.append(Part(positions=positions, faces=own, material=material, normals=normals, texcoords=texcoords))
-    return parts
+    faces, _ = triangulate(positions, np.arange(len(positions)), sizes)
+    material, texcoords = make_material(image.values(RGB, "sRGB")), texcoords * [1, -1] + [0, 1]
+    return Part(positions=positions, faces=faces, material=material, normals=normals, texcoords=texcoords)
+
+
+def _note_loose(corners: np.ndarray, count: int, loading: Loading) -> None:
+    """Notes how many of the vertices no face has."""
+    if len(corners) and (loose := count - len(np.unique(corners))):
+        loading.ignored.add(f"{loose:,} vertices of no face")
 
 
 def load_stl(path: Path, loading: Loading) -> list[Part]:
@@ -138,7 +141,9 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
         loading.ignored.add("colours of some faces alone, or by a palette")
-    return colored_part(columns, np.array([number for own in corners for number in own]), sizes, of_faces, loading)
+    numbers = np.array([number for own in corners for number in own])
+    _note_loose(numbers, num_vertices, loading)
+    return colored_part(columns, numbers, sizes, of_faces, loading)
 
 
 PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
@@ -147,17 +152,20 @@ PLAIN = {".ply": load_ply_mesh, ".stl": load_stl, ".off": load_off}
 def colored_part(
     vertices: Columns, corners: np.ndarray, sizes: np.ndarray, of_faces: Columns, loading: Loading
 ) -> list[Part]:
-    """The part of polygons with `sizes` corners each, coloured by its vertices, else by its polygons."""
+    """The part of polygons with `sizes` corners each, coloured by its vertices, else by its polygons.
+
+    Vertices of one colour beside polygons of several do not count.
+    """
     columns = useful(vertices)
     positions = stack_columns(columns)
-    if len(corners) and (loose := len(positions) - len(np.unique(corners))):
-        loading.ignored.add(f"{loose:,} vertices of no face")
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     if {"roughness", "metallic"} & columns.keys():
         loading.ignored.add("roughness and metallic of vertices")
     alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
-    if colors is None and (found := colors_of(rename(of_faces))) is not None:
+    found = colors_of(rename(of_faces)) if colors is None or not _varies(colors) else None
+    if found is not None and (colors is None or _varies(found[0])):
+        loading.ignored |= set() if colors is None else {"the one colour of all vertices, beside those of faces"}
         normals, alpha = (None if x is None else x[faces.ravel()] for x in (normals, alpha))
         positions = positions[faces.ravel()]
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
@@ -165,3 +173,8 @@ def colored_part(
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]
+
+
+def _varies(colors: np.ndarray) -> bool:
+    """Whether colours (n, 3) are not all the same."""
+    return bool((colors != colors[:1]).any())

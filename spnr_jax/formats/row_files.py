@@ -180,6 +180,8 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
             found = read_elements(file, header, "chunk", "vertex")
             yield unpack_columns(found["chunk"][0], found["vertex"][0])
             return
+        if others := [name for name, count, _ in header.elements if count and name != "vertex"]:
+            report(f"not read: the PLY elements {list_names(others)}")
         for _, columns, lists in element_pieces(file, header, "vertex"):
             fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}
             if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
@@ -276,7 +278,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
     try:
         names = entries["FIELDS"]
         counts = map(int, entries.get("COUNT", ["1"] * len(names)))
-        num_points = int((entries.get("POINTS") or entries["WIDTH"])[0])
+        num_points = int(entries["POINTS"][0]) if entries.get("POINTS") else _count_pixels(entries)
         types = [KINDS[kind] + str(int(size)) for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)]
         # "F 4" in ASCII is read as f8: the text may have more digits
         types = [kind if encoding != "ascii" else kind.replace("<f4", "<f8") for kind in types]
@@ -298,6 +300,11 @@ def _pcd_header(file: BufferedIOBase) -> Header:
     organised = entries.get("HEIGHT", ["1"])[:1] not in (["0"], ["1"])
     points = "vertex", num_points, [field for field in properties if field[2]]
     return Header(encoding, [points], organised=organised, sensor=sensor)
+
+
+def _count_pixels(entries: dict[str, list[str]]) -> int:
+    """The number of points of a PCD header that names none: those of its rows and columns."""
+    return int(entries["WIDTH"][0]) * int((entries.get("HEIGHT") or ["1"])[0])
 
 
 # --- compressed PCD ---------------------------------------------------------------------------------------------------

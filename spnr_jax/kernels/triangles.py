@@ -42,7 +42,10 @@ def triangulate(
 
 
 def ears(corners: np.ndarray) -> np.ndarray:
-    """Triangles (n - 2, 3) of a simple polygon with corners (n, 3), as indices; a fan if it is not simple."""
+    """Triangles (n - 2, 3) of a simple polygon with corners (n, 3), as indices; a fan if it is not simple.
+
+    Two edges may lie on each other: the bridge to a hole.
+    """
     centred = corners - corners.mean(axis=0)
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
@@ -53,6 +56,7 @@ def ears(corners: np.ndarray) -> np.ndarray:
         edges = flat[[ear[1], ear[2], ear[0]]] - flat[ear]
         beside = flat[[j for j in left if j not in ear]][:, None] - flat[ear]
         inside = (edges[:, 0] * beside[..., 1] - edges[:, 1] * beside[..., 0] >= 0).all(axis=1)
+        inside &= beside.any(axis=2).all(axis=1)  # corners in the place of one of the ear's are those of a bridge
         if edges[0, 0] * edges[1, 1] > edges[0, 1] * edges[1, 0] and not inside.any():
             found.append(tuple(ear))
             left.pop(i)

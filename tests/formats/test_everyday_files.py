@@ -195,6 +195,7 @@ SEEN = {  # columns of the ball, points that are left, what a line says
     "activated splats": (F_DC | {"opacity": np.where(PART, 0.1, 0.9)}, ~PART, HIDDEN),
     "half transparent splats": (F_DC | {"opacity": np.full(420, 0.5)}, ..., "red green blue taken"),
     "splats of bytes": (F_DC | {"opacity": np.where(PART, 9, 250.0)}, ~PART, HIDDEN),
+    "splats of which none is half transparent": (F_DC | {"opacity": np.where(PART, 3.5, 70.5)}, ..., "red green blue"),
     "splats of 0 and 1": (F_DC | {"opacity": np.where(PART, -np.inf, np.inf)}, ~PART, HIDDEN),
 }
 
@@ -286,7 +287,13 @@ def test_a_line_says_what_looks_wrong_with_positions_and_normals_which_are_left_
 
 def test_a_mesh_of_short_floats_far_away_is_refused(tmp_path):
     with pytest.raises(ValueError, match="0.5 apart at best in float32, for an extent of 1; move them"):
-        read(write(tmp_path, "a.stl", stl(2, at=UTM)))
+        read(write(tmp_path, "a.stl", stl(2, at=UTM + [0, 0, 0.1])))
+
+
+def test_a_mesh_far_away_with_whole_halves_is_not_taken_for_rounded(tmp_path):
+    """A house in metres: each of its coordinates happens to be a short float."""
+    cloud, _ = read(write(tmp_path, "a.stl", stl(2, at=np.array([500_000.5, 5_200_000.5, 120.0]))))
+    assert np.ptp(cloud.positions, axis=0) == pytest.approx([1, 1, 0], abs=0.05)
 
 
 def test_a_mesh_far_away_whose_file_has_six_digits_is_said_to_be_rounded(tmp_path):

@@ -1,7 +1,10 @@
 """Meshes as people have them: polygons, STL files that say something else, faces without numbers, textures."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 from support.mesh_files import CORNERS, RGB, square_ply, stl
 from support.point_clouds import GREEN, LINEAR, read, write
 
@@ -19,6 +22,17 @@ def test_an_l_of_one_face_keeps_its_notch_wherever_the_face_begins(tmp_path):
             cloud = read_cloud(write(tmp_path, name, content), num_points=1000)
             assert not (cloud.positions[:, :2] > 0.501).all(axis=1).any()
             assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
+
+
+def test_a_polygon_with_a_bridge_to_its_hole_leaves_the_hole_empty_wherever_it_begins():
+    outer, hole = [(0, 0), (4, 0), (4, 4), (0, 4)], [(1, 1), (1, 3), (3, 3), (3, 1)]
+    corners = np.array([(*corner, 0) for corner in [*outer, outer[0], *hole, hole[0]]], float)
+    for roll in range(len(corners)):
+        rolled = np.roll(corners, roll, axis=0)
+        a, b, c = np.moveaxis(rolled[ears(rolled)], 1, 0)
+        assert np.abs(np.cross(b - a, c - a)[:, 2]).sum() / 2 == pytest.approx(16 - 4)
+        middles = ((a + b + c) / 3)[np.abs(np.cross(b - a, c - a)[:, 2]) > 0]
+        assert not (np.abs(middles[:, :2] - 2) < 1).all(axis=1).any()
 
 
 def test_a_wavy_polygon_of_many_corners_keeps_its_area():
@@ -65,8 +79,6 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
 
 @pytest.mark.parametrize("name", [r"C:\Users\me\Colors.PNG", "/home/me/colors.png", r"Maps\COLORS.png"])
 def test_a_texture_beside_its_mesh_is_found_under_a_path_of_another_machine(tmp_path, name):
-    from PIL import Image
-
     place = tmp_path / "maps" / "colors.png" if "Maps" in name else tmp_path / "colors.png"
     place.parent.mkdir(exist_ok=True)
     Image.new("RGB", (4, 4), GREEN).save(place)
@@ -76,3 +88,105 @@ def test_a_texture_beside_its_mesh_is_found_under_a_path_of_another_machine(tmp_
     cloud, lines = read(tmp_path / "a.obj", num_points=20)
     np.testing.assert_allclose(cloud.base_color, np.broadcast_to(LINEAR, (20, 3)), atol=2e-3)
     assert not any("missing" in line for line in lines)
+
+
+TWO_SQUARES = "".join(f"v {x} {y} {z}\n" for z in (0, 5) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+TEXCOORDS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+
+
+def textured_obj(folder: Path, image: str, mtl: bytes) -> Path:
+    """A green square of the material `a`, whose image and library lie where they are said to."""
+    (folder / image).parent.mkdir(exist_ok=True)
+    Image.new("RGB", (4, 4), GREEN).save(folder / image)
+    write(folder, "a.mtl", mtl)
+    vertices = "".join(f"v {corner}\n" for corner in CORNERS)
+    return write(folder, "a.obj", f"mtllib a.mtl\n{vertices}{TEXCOORDS}usemtl a\nf 1/1 2/2 3/3 4/4\n")
+
+
+def is_green(cloud) -> bool:
+    return np.allclose(cloud.base_color, np.broadcast_to(LINEAR, cloud.base_color.shape), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("page", "names"), [("cp1251", "Стена Крыша"), ("gbk", "墙壁 屋顶"), ("shift_jis", "かべ やね")]
+)
+def test_names_in_an_older_code_page_stay_apart_and_find_their_images(tmp_path, page, names):
+    first, second = names.split()
+    text = f"mtllib a.mtl\n{TWO_SQUARES}usemtl {first}\nf 1 2 3 4\nusemtl {second}\nf 5 6 7 8\n"
+    write(tmp_path, "a.mtl", f"newmtl {first}\nKd 1 0 0\nnewmtl {second}\nKd 0 0 1\n".encode(page))
+    cloud = read_cloud(write(tmp_path, "a.obj", text.encode(page)), num_points=50)
+    np.testing.assert_array_equal(cloud.base_color, np.where(cloud.positions[:, 2:] < 1, [1, 0, 0], [0, 0, 1]))
+    path = textured_obj(tmp_path, f"{first}.png", f"newmtl a\nmap_Kd {first}.png\n".encode(page))
+    assert is_green(read_cloud(path, num_points=20))
+
+
+@pytest.mark.parametrize("image", ["textures/wood.png", "../textures/wood.png", "../Textures/wood.png"])
+@pytest.mark.parametrize("name", ["wood.png", "../textures/wood.png", "C:/Users/me/wood.png"])
+def test_images_in_a_folder_of_textures_in_or_beside_that_of_the_mesh_are_found(tmp_path, image, name):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    cloud, lines = read(textured_obj(folder, image, f"newmtl a\nmap_Kd {name}\n".encode()), num_points=20)
+    assert is_green(cloud)
+    assert not any("missing" in line for line in lines)
+
+
+def test_colours_of_vertices_do_not_darken_the_texture_beside_them(tmp_path):
+    path = textured_obj(tmp_path, "wood.png", b"newmtl a\nmap_Kd wood.png\n")
+    write(tmp_path, "a.obj", path.read_text().replace(" 0.0\n", " 0.0 0.2 0.6 0.3\n"))
+    cloud, lines = read(path, num_points=20)
+    assert is_green(cloud)
+    assert "colours of the vertices not used beside those of a texture" in lines
+
+
+def test_numbers_of_a_library_have_decimal_commas_and_those_that_are_words_cost_no_mesh(tmp_path):
+    text = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\nf 1 2 3 4\n"
+    write(tmp_path, "a.obj", text)
+    cases = {"Kd 0,25 0 1\nNs\nd\n": ([0.25, 0, 1], False), "Kd xyz 0.1 0.2 0.3": ([0.5, 0.5, 0.5], True)}
+    for mtl, (color, said) in cases.items():
+        write(tmp_path, "a.mtl", f"newmtl a\n{mtl}")
+        cloud, lines = read(tmp_path / "a.obj", num_points=5)
+        np.testing.assert_array_equal(cloud.base_color, np.broadcast_to(color, (5, 3)))
+        assert any("has a number in its MTL that cannot be read: 'kd xyz 0.1 0.2 0.3'" in x for x in lines) == said
+
+
+PLY_HEAD = "ply\nformat ascii 1.0\n{}element vertex 8\n" + "".join(f"property float {x}\n" for x in "xyz")
+
+
+def two_squares_ply(comments: str, of_vertex: str, of_face: str, vertex: str, faces: list[str]) -> str:
+    """A PLY of a square at z 0 and one at z 5 with further properties, `vertex` those of each vertex."""
+    head = PLY_HEAD.format(comments) + of_vertex + "element face 2\nproperty list uchar int vertex_indices\n"
+    rows = "".join(f"{line[2:]} {vertex}\n" for line in TWO_SQUARES.splitlines())
+    rows += "".join(f"4 {' '.join(str(4 * i + j) for j in range(4))} {face}\n" for i, face in enumerate(faces))
+    return f"{head}{of_face}end_header\n{rows}"
+
+
+@pytest.mark.parametrize("number", [-1, 7])
+def test_faces_of_a_ply_that_show_no_image_are_drawn_in_their_own_colours(tmp_path, number):
+    Image.new("RGB", (4, 4), GREEN).save(tmp_path / "wood.png")
+    of_face = "property list uchar float texcoord\nproperty int texnumber\n"
+    uv = "8 0 0 1 0 1 1 0 1"
+    for missing in ("wood.png", "gone.png"):
+        comments = f"comment TextureFile wood.png\ncomment TextureFile {missing}\n"
+        faces = [f"{uv} 0", f"{uv} {number if missing == 'wood.png' else 1}"]
+        cloud, lines = read(write(tmp_path, "a.ply", two_squares_ply(comments, "", of_face, "", faces)), num_points=400)
+        low = cloud.positions[:, 2] < 1
+        assert np.mean(low) == pytest.approx(0.5, abs=0.05)
+        assert is_green(cloud.replace(base_color=cloud.base_color[low]))
+        assert (cloud.base_color[~low] == 0.5).all()
+        assert "1 of 2 faces show no image of the file: their own colours taken" in lines
+
+
+def test_colours_of_faces_count_if_all_vertices_have_the_same(tmp_path):
+    colors = "".join(f"property uchar {x}\n" for x in RGB)
+    content = two_squares_ply("", colors, colors, "255 255 255", ["255 0 0", "0 0 255"])
+    cloud, lines = read(write(tmp_path, "a.ply", content), num_points=50)
+    np.testing.assert_array_equal(cloud.base_color, np.where(cloud.positions[:, 2:] < 1, [1, 0, 0], [0, 0, 1]))
+    assert any("the one colour of all vertices, beside those of faces" in line for line in lines)
+
+
+def test_lines_and_other_elements_that_are_not_read_are_said(tmp_path):
+    lines = read(write(tmp_path, "a.obj", TWO_SQUARES + "l 1 2 3\nl 5 6\n"))[1]
+    assert "ignored: lines" in lines
+    more = "element material 1\nproperty uchar red\n"
+    content = two_squares_ply(more, "", "", "", ["", ""]).replace("end_header\n", "end_header\n7\n")
+    assert "ignored: PLY element material" in read(write(tmp_path, "a.ply", content), num_points=9)[1]

@@ -78,6 +78,9 @@ def test_our_own_spz_files_and_those_of_version_2_are_read_and_others_are_named(
         path.write_bytes(gzip.compress(data))
         with pytest.raises(ValueError, match=reason):
             read_cloud(path)
+    path.write_bytes(gzip.compress(content)[:-20])
+    with pytest.raises(ValueError, match="is cut off, or larger"):
+        read_cloud(path)
 
 
 def test_compressed_splats_in_a_ply_are_unpacked(tmp_path):

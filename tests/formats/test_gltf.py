@@ -288,6 +288,14 @@ def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
     np.testing.assert_allclose(metallic, [[0, 0, 0, 1, 1, 1, 0, 0, 0]], atol=2e-2)
 
 
+def test_a_primitive_without_positions_and_a_header_padded_with_zeros_cost_no_mesh(tmp_path):
+    path = square(change=lambda d: d["meshes"][0]["primitives"].append({"attributes": {}})).write(tmp_path / "a.gltf")
+    path.write_bytes(path.read_bytes() + b"\0\0")
+    asset = load_mesh(path)
+    np.testing.assert_array_equal(asset.parts[0].positions, CORNERS)
+    assert "primitives without positions" in asset.ignored
+
+
 def test_what_is_not_modelled_is_named(tmp_path):
     builder = GltfBuilder(animations=[{"channels": []}], extensionsUsed=["KHR_lights_punctual"])
     texture, sheen = {"index": builder.texture(CHECKER)}, {"KHR_materials_sheen": {}}

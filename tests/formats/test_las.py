@@ -77,6 +77,18 @@ def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffi
         read_cloud(tmp_path / f"a{suffix}")
 
 
+def test_extra_bytes_whose_names_are_not_in_utf_8_are_named(tmp_path):
+    import laspy
+
+    scan = laspy.create(point_format=0, file_version="1.2")
+    scan.add_extra_dim(laspy.ExtraBytesParams("Hoehe", "f4"))
+    scan.x = scan.y = scan.z = np.arange(12.0)
+    scan.write(tmp_path / "a.las")
+    content = (tmp_path / "a.las").read_bytes()
+    with pytest.raises(ValueError, match="has extra bytes whose names are not in UTF-8: export it without them"):
+        read_cloud(write(tmp_path, "a.las", content.replace(b"Hoehe", "Höhe\0".encode("latin-1"))))
+
+
 @pytest.mark.parametrize("size", [4, 6])
 def test_chunks_of_other_sizes_than_announced_never_reach_the_library(size, tmp_path):
     as_scan(tmp_path / "a.las", WHOLE, 7)

@@ -53,6 +53,12 @@ def test_pieces_are_small_and_together_the_whole_file(tmp_path, name, monkeypatc
     np.testing.assert_array_equal(read(path)[0].positions, WHOLE.positions)
 
 
+def test_a_pcd_without_a_number_of_points_has_its_rows_times_its_columns(tmp_path):
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 4\nDATA ascii\n"
+    path = write(tmp_path, "a.pcd", header + "".join(f"{i % 3} {i // 3} {i % 2}\n" for i in range(12)))
+    assert len(clouds.read_cloud(path).positions) == 12
+
+
 @pytest.mark.parametrize("name", ANNOUNCED)
 def test_what_says_how_much_it_holds_is_refused_wherever_it_is_cut(tmp_path, name):
     path = written(tmp_path, name, WHOLE)
@@ -154,7 +160,11 @@ REFUSED = [
     ("a.ply", b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "known format"),
     ("a.ply", PLY + b"element vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
     ("a.ply", PLY + b"element edge 0\nend_header\n", "no PLY element 'vertex', only edge"),
-    ("a.ply", PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n", "300"),
+    (
+        "a.ply",
+        PLY + b"element vertex 1\nproperty uchar x\nend_header\n300\n",
+        "1 numbers of the header's types, found '300'",
+    ),
     ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found x"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 " * 6 + "\n", r"shape \(1, 18\)"),
