@@ -8,7 +8,7 @@ from importlib import import_module, metadata
 
 from jaxlib import version  # without JAX
 
-_PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "method.model"}
+_PUBLIC = {"load": "training.weights", "Model": "method.model", "Volume": "kernels.records"}
 _PUBLIC |= dict.fromkeys(("Plan", "plan", "render"), "method.surfel_renderer")
 _PUBLIC |= {"neighbors": "surfels.neighbors", "encode": "method.surfel_renderer", "densify": "method.densifier"}
 _PUBLIC |= {"read_cloud": "formats.clouds", "make_cloud": "kernels.cloud_arrays", "clean": "kernels.cleaning"}

@@ -51,8 +51,8 @@ class Method:
     loss."""
     init: Function = lazy("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
-    encode: Function = lazy("spnr_jax.method.inference:encode_volume")
-    """(variables, cloud, centre, scale, *, config) -> `Volume` of a cloud in the box, unbatched."""
+    encode: Function = lazy("spnr_jax.method.inference:encode_object")
+    """(variables, cloud, centre, scale, *, config) -> `Encoded` cloud in the box, unbatched."""
     render: Function = lazy("spnr_jax.method.inference:render_each")
     """(variables, volume, views, lights, *, config, quality) -> iterator of `Rendering`s, one per view."""
     prepare: Function = lazy("spnr_jax.training.batching:prepare")
@@ -91,7 +91,7 @@ METHODS: dict[str, Method] = {
     "surfels": Method(
         config=SurfelConfig,
         init=lazy("spnr_jax.method.surfel_method:init"),
-        encode=lazy("spnr_jax.method.surfel_method:encode_volume"),
+        encode=lazy("spnr_jax.method.surfel_method:encode_object"),
         render=lazy("spnr_jax.method.surfel_method:render_each"),
         prepare=lazy("spnr_jax.training.gbuffers:prepare"),
         loss=lazy("spnr_jax.training.gbuffers:loss"),
@@ -102,7 +102,7 @@ METHODS: dict[str, Method] = {
     "paper": Method(
         config=PaperConfig,
         network="spnr_jax.method.paper_method:PaperNetwork",
-        encode=lazy("spnr_jax.method.paper_method:encode_volume"),
+        encode=lazy("spnr_jax.method.paper_method:encode_object"),
         render=lazy("spnr_jax.method.paper_method:render_each"),
         discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
         label="The paper's network",

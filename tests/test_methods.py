@@ -66,7 +66,7 @@ def test_it_is_loaded_with_its_file_and_refused_in_one_line_without(name, run, f
     volume = handle.encode(cloud)
     image = np.asarray(handle.render(volume, handle.camera(volume)).image)
     mean = np.asarray(cloud.base_color).mean(axis=0)
-    np.testing.assert_allclose(image[5, 5], mean * np.asarray(handle.variables["params"]["weight"]), rtol=1e-4)
+    np.testing.assert_allclose(image[5, 5], mean * np.asarray(handle.params["params"]["weight"]), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from experiments.comparison.study_objects import each_view
 from spnr_jax.config import Quality, TrainConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset, ObjectData
-from spnr_jax.kernels.records import Volume
+from spnr_jax.kernels.records import Encoded
 from spnr_jax.method.model import Model
 from spnr_jax.methods import METHODS, method_of
 from spnr_jax.scoring import evaluation
@@ -64,7 +64,7 @@ def of_model(model: Model, quality: Quality = "best") -> Method:
     )
 
 
-def draw_volume(model: Model, volume: Volume, item: ObjectData, quality: Quality = "best") -> Pictures:
+def draw_volume(model: Model, volume: Encoded, item: ObjectData, quality: Quality = "best") -> Pictures:
     """The views of an object whose volume there is, each in its own light, where it has one."""
     found = list(model.render_each(volume, each_view(item), quality, item.own_lights))
     image, acc, depth = (np.stack([np.asarray(getattr(one, x)) for one in found]) for x in ("image", "acc", "depth"))

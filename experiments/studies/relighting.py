@@ -29,7 +29,7 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.kernels.records import Volume
+from spnr_jax.kernels.records import SurfelScene
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.evaluation import Pictures, check_known_light
 from spnr_jax.training.weights import load
@@ -101,22 +101,22 @@ def name_of(dataset: data_sets.Dataset) -> str:
 def measure(options: RelightingStudy, model: Model, count: int, item: ObjectData) -> Measured:
     """Mean scores of an object's views, by method, and the network's first picture."""
     item = cut(item, count, options.views, options.resolution)
-    volume = model.encode(item.cloud)
+    lit = model.encode(item.cloud)
+    assert isinstance(lit, SurfelScene), "networks of surfels alone take a light"
     found: dict[str, dict] = {}
     drawn: dict[str, Pictures] = {}
     for method, quality in METHODS.items():
-        scene = remove_shadows(volume) if method == UNSHADOWED else volume
+        scene = remove_shadows(lit) if method == UNSHADOWED else lit
         pictures = drawn[method] = draw_volume(model, scene, item, quality)
         of_views = scores.score_views(item, pictures) | {"log_error": log_errors(item, pictures)}
         found[method] = scores.mean_scores({name: of_views[name] for name in COLUMNS})
     return found, np.asarray(drawn[NETWORK].image[0])
 
 
-def remove_shadows(volume: Volume) -> Volume:
-    """The volume as if every direction saw every point."""
-    surfels = volume.scene.surfels
-    surfels = dataclasses.replace(surfels, visibility=jnp.ones_like(surfels.visibility))
-    return dataclasses.replace(volume, scene=dataclasses.replace(volume.scene, surfels=surfels))
+def remove_shadows(scene: SurfelScene) -> SurfelScene:
+    """The scene as if every direction saw every point."""
+    surfels = dataclasses.replace(scene.surfels, visibility=jnp.ones_like(scene.surfels.visibility))
+    return dataclasses.replace(scene, surfels=surfels)
 
 
 def log_errors(item: ObjectData, pictures: Pictures) -> list[float]:

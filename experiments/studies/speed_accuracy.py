@@ -39,7 +39,7 @@ from spnr_jax.devices import runtime
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Volume
+from spnr_jax.kernels.records import Encoded
 from spnr_jax.method.model import Model
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training.weights import load
@@ -142,7 +142,7 @@ def _scatter(axes: Axes, rows: Sequence[dict], y: str) -> None:
     axes.set_ylabel(LABELS[y])
 
 
-Volumes = dict[tuple[str, int], tuple[Volume, float]]  # of object, points: encoded, in so many ms
+Volumes = dict[tuple[str, int], tuple[Encoded, float]]  # of object, points: encoded, in so many ms
 REPEATS = 2
 TIMED_OBJECTS = 4
 

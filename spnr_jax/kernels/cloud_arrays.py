@@ -24,17 +24,20 @@ from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
 
 SMALLEST_BUCKET = 512
+ON_HOST = "runs on the host, so jit, vmap and grad cannot trace it; call it before them"
+NEEDED = ("positions", "base_color", "roughness", "metallic", "mask")  # fields of a cloud that are never None
 VECTORS = ("positions", "base_color", "normals")  # fields of a cloud with three numbers a point
 
 
 def pad(cloud: PointCloud, size: int) -> PointCloud:
-    """The cloud (points, ...), padded with zeros to `size` points; `mask` is False for padding."""
+    """The cloud (points, ...), padded with zeros to `size` points; `mask` is False for padding.  Pure."""
     missing = size - len(cloud.mask)
     if missing < 0:
         raise UserError(f"a cloud of {len(cloud.mask)} points does not fit into {size}; thin it out first")
 
     def extend(values):
-        return np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
+        xp = array_namespace(values)
+        return xp.concatenate([values, xp.zeros((missing, *values.shape[1:]), values.dtype)])
 
     return jax.tree.map(extend, cloud)
 
@@ -54,16 +57,34 @@ def check_cloud(cloud: PointCloud, where: str, *, batched: bool = False) -> None
         raise UserError(f"{where}: cloud.mask has the shape {shape}, expected (points,); use jax.vmap for more clouds")
     for name, values in vars(cloud).items():
         wanted = (*shape, 3) if name in VECTORS else shape
+        if values is None and name in NEEDED:
+            raise UserError(f"{where}: cloud.{name} is None, expected an array {wanted}")
         if values is not None and np.shape(values) != wanted:
             raise UserError(f"{where}: cloud.{name} has the shape {np.shape(values)}, expected {wanted}")
     if not shape[-1]:
         raise UserError(f"{where}: the cloud has no points; give at least one")
 
 
+def check_finite(cloud: PointCloud, where: str) -> None:
+    """ValueError, which names the function and the field, for points with NaN or infinity; of traced arrays none."""
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(cloud)):
+        return
+    mask = np.asarray(cloud.mask)
+    for name, values in vars(cloud).items():
+        if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
+            raise UserError(f"{where}: cloud.{name} has NaN or infinity; remove those points")
+
+
 def refuse_tracers(arrays: Any, where: str) -> None:
     """ValueError, which names the function, for arrays that JAX traces: what runs on the host needs their values."""
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arrays)):
-        raise UserError(f"{where}: runs on the host, so jit, vmap and grad cannot trace it; call it before them")
+        raise UserError(f"{where}: {ON_HOST}")
+
+
+def refuse_jit(where: str) -> None:
+    """ValueError, which names the function, inside `jit`: programs with options of their own cannot be called there."""
+    if isinstance(jax.numpy.add(0, 0), jax.core.Tracer):
+        raise UserError(f"{where}: {ON_HOST}")
 
 
 def strip(cloud: PointCloud) -> PointCloud:

@@ -120,9 +120,9 @@ class Scene:
 
 @record
 class Volume:
-    """An encoded object in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
+    """An object as a Linen network encodes it, in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
-    `scene` is the network's encoding: a `Scene` for the paper's network, a `SurfelScene` for surfels.
+    `scene` is the network's encoding: a `Scene` for the paper's network.
     """
 
     scene: Any
@@ -179,6 +179,9 @@ class SurfelScene:
     spacing: Float[AnyArray, "*batch"]
     centre: Float[AnyArray, "*batch 3"]
     scale: Float[AnyArray, "*batch"]
+
+
+Encoded = Volume | SurfelScene  # what Model.encode returns: a scene for surfels, a volume for other networks
 
 
 @record

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spnr_jax.devices.programs import object_groups
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import Rays, record
@@ -213,8 +214,11 @@ def scatter_mean(
 ) -> tuple[Float[Array, "*batch d d d features"], Float[Array, "*batch d d d"]]:
     """Mean of the point features in each voxel (0 where there is none), and 1 where a voxel holds a point.
 
-    Masked points and points outside the box are dropped.
+    Masked points and points outside the box are dropped.  ValueError for arrays of other numbers of points.
     """
+    shapes = positions.shape[:-1], features.shape[:-1], mask.shape
+    if len(set(shapes)) > 1:
+        raise UserError(f"scatter_mean: positions, features and mask are of {shapes} points; expected the same")
     if positions.ndim > 2:
         return jax.vmap(lambda p, f, m: scatter_mean(p, f, m, resolution))(positions, features, mask)
     rows, values = mean_contributions(positions, features, mask, resolution)

@@ -3,6 +3,7 @@
 Values are checked only outside of programs: traced arrays have none.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ def check_neighbors(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], wh
     if np.shape(neighbors) != (wanted := (len(cloud.mask), NEIGHBORS)):
         found = f"has the shape {np.shape(neighbors)}, expected {wanted}"
         raise UserError(f"{where}: neighbors {found}; they are spnr_jax.neighbors(cloud)")
+    cloud_arrays.check_finite(cloud, where)
     if not isinstance(neighbors, jax.core.Tracer):
         values = np.asarray(neighbors)
         low, high = values.min(initial=-1), values.max(initial=-1)
@@ -32,7 +34,7 @@ def check_neighbors(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"], wh
 
 def check_scene(scene: SurfelScene, where: str) -> None:
     """ValueError unless it is a scene."""
-    check_kind(scene, SurfelScene, f"{where}: expected a scene of spnr_jax.encode, or volume.scene")
+    check_kind(scene, SurfelScene, f"{where}: expected a scene of spnr_jax.encode or Model.encode")
 
 
 def check_camera_kind(camera: Any) -> None:
@@ -51,9 +53,10 @@ def check_camera(camera: Camera, where: str) -> None:
     """ValueError, which names the function, for a camera or a batch of cameras that cannot be drawn; on the host."""
     check_camera_kind(camera)
     cloud_arrays.refuse_tracers(camera, where)
-    tails = [np.shape(x)[-2:] for x in jax.tree.leaves(camera)]
-    if tails != [(3, 4), (3, 3)]:
-        raise UserError(f"{where}: expected a pose (3, 4) and intrinsics (3, 3) of the camera, got {tails}")
+    pose, intrinsics = np.shape(camera.cam_to_world), np.shape(camera.intrinsics)
+    if pose[-2:] != (3, 4) or intrinsics[-2:] != (3, 3) or intrinsics[:-2] not in ((), pose[:-2]):
+        expected = "a pose (3, 4) and intrinsics (3, 3) of the camera, with the same axes before them"
+        raise UserError(f"{where}: expected {expected}, got {pose} and {intrinsics}")
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(camera)):
         raise UserError(f"{where}: the camera's pose or intrinsics hold NaN or infinity")
     if not np.min(np.asarray(camera.intrinsics)[..., (0, 1), (0, 1)]) > 0:
@@ -75,5 +78,8 @@ def check_view(params: dict | None, scene: SurfelScene, camera: Camera, light: L
     ):
         if np.shape(array) != wanted:
             raise UserError(f"render: {what} has the shape {np.shape(array)}, expected {wanted}; use jax.vmap for more")
+    check_kind(params, Mapping | None, "render: expected params=model.params, or None")
     if params is not None and "params" not in params:
         raise UserError(f"render: expected params=model.params, or None; got a dict of {', '.join(params)}")
+    if params is not None and "top" not in params["params"]:
+        raise UserError("render: these params are of another network; use Model.render, or those of spnr_jax.load()")

@@ -9,12 +9,13 @@ differentiable.
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import clamp
 from spnr_jax.kernels.records import AnyArray, PointCloud
 from spnr_jax.method.checks import check_neighbors
@@ -38,6 +39,7 @@ def densify(params: dict, cloud: PointCloud, neighbors: Int[AnyArray, "points 20
     `spnr_jax.neighbors(cloud)`; find them anew for the result before `encode`.  All points of the result have normals:
     given, estimated or predicted.  `learned` is 0 for measured points.  UserError for params without a densifier.
     """
+    check_kind(params, Mapping, "densify: expected model.params")
     if "densifier" not in params:
         raise UserError("densify: these params have no densifier; use those of spnr_jax.load()")
     check_neighbors(cloud, neighbors, "densify")

@@ -2,7 +2,7 @@
 
     encode, render               batches of objects, in the box; pure
     loss                         loss of a training batch; pure
-    encode_volume, render_each   one object, compiled: for the handle (model.py), scores and the viewer
+    encode_object, render_each   one object, compiled: for the handle (model.py), scores and the viewer
 
 The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
 Values sown into the collection "losses" are added to the loss.
@@ -139,7 +139,7 @@ def reconstruction_loss(
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def encode_volume(
+def encode_object(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: NetworkConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched); compiled once per padded size."""

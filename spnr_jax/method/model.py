@@ -20,7 +20,7 @@ import numpy as np
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Rendering, SurfelScene, Volume, unstack
+from spnr_jax.kernels.records import Camera, Encoded, Light, PointCloud, Rendering, unstack
 from spnr_jax.method.checks import check_camera_kind, check_light
 from spnr_jax.methods import method_of
 
@@ -39,22 +39,27 @@ class Model:
     """
 
     config: NetworkConfig
-    variables: dict = field(repr=False)
+    params: dict = field(repr=False)
+    """The variables: the first argument of `spnr_jax.encode` and `spnr_jax.render`.
 
-    def encode(self, cloud: PointCloud, densify: bool = True) -> Volume:
-        """Volume of a cloud (unbatched, any units, y up).  ValueError if it is empty or contains NaN or infinity.
+    The shader's weights are in `params["params"]`, as Flax has it, and the densifier's in `params["densifier"]`.
+    """
+
+    def encode(self, cloud: PointCloud, densify: bool = True) -> Encoded:
+        """What `render` draws of a cloud (unbatched, any units, y up): for surfels a scene, as of `spnr_jax.encode`.
+
+        ValueError if it is empty or contains NaN or infinity.
 
         Without `densify`, a sparse cloud gets no learned points: faster, but less sharp at rims and on curved parts.
         """
         cloud_arrays.check_cloud(cloud, "encode")
         cloud_arrays.refuse_tracers(cloud, "Model.encode")
+        cloud_arrays.refuse_jit("Model.encode")
         positions = np.asarray(cloud.positions, np.float32)
         mask = np.asarray(cloud.mask)
         if not mask.any():
             raise UserError("encode: the cloud has no points; give at least one")
-        for name, values in vars(cloud).items():
-            if values is not None and not np.isfinite(np.asarray(values)[mask]).all():
-                raise UserError(f"the cloud has NaN or infinity in its {name}; remove those points")
+        cloud_arrays.check_finite(cloud, "encode")
         for name in ("base_color", "roughness", "metallic"):
             given = np.asarray(getattr(cloud, name))[mask]
             if given.min() < 0 or given.max() > 1:
@@ -69,11 +74,11 @@ class Model:
         cloud = dataclasses.replace(cloud, positions=inside)
         method = method_of(self.config)
         left_out = () if densify else method.companions
-        variables = {name: tree for name, tree in self.variables.items() if name not in left_out}
-        return method.encode(variables, cloud, centre, scale, config=self.config)
+        params = {name: tree for name, tree in self.params.items() if name not in left_out}
+        return method.encode(params, cloud, centre, scale, config=self.config)
 
     def render(
-        self, volume: Volume, camera: Camera, quality: Quality = "best", light: Light | None = None
+        self, volume: Encoded, camera: Camera, quality: Quality = "best", light: Light | None = None
     ) -> Rendering:
         """The object as seen by the camera (unbatched, or with one axis of views); depth in the cloud's units.
 
@@ -84,14 +89,19 @@ class Model:
         of its samples per ray.  At `trained` it samples the whole box, as in training.
         """
         check_camera_kind(camera)
-        if camera.cam_to_world.ndim == 2:
+        axes = np.shape(camera.cam_to_world)[:-2]
+        if not axes:
             return next(self.render_each(volume, [camera], quality, [light]))
-        drawn = self.render_each(volume, unstack(camera), quality, [light] * len(camera.cam_to_world))
+        if len(axes) > 1:
+            raise UserError(f"render: expected one camera, or one axis of them, got axes {axes}")
+        intrinsics = np.broadcast_to(camera.intrinsics, (*axes, 3, 3))  # also one for all views
+        views = unstack(dataclasses.replace(camera, intrinsics=intrinsics))
+        drawn = self.render_each(volume, views, quality, [light] * len(views))
         return jax.tree.map(lambda *x: np.stack(x), *drawn)
 
     def render_each(
         self,
-        volume: Volume,
+        volume: Encoded,
         views: Sequence[Camera],
         quality: Quality = "best",
         lights: Sequence[Light | None] | None = None,
@@ -102,16 +112,19 @@ class Model:
         """
         if quality not in get_args(Quality):
             raise UserError(f"quality must be one of {', '.join(get_args(Quality))}, got {quality}")
-        check_kind(volume, Volume, "render: expected a volume of Model.encode")
+        check_kind(volume, Encoded, "render: expected what Model.encode returns")
+        if np.ndim(volume.scale):
+            raise UserError(f"render: expected one object, got a stack {np.shape(volume.scale)}; use jax.vmap for more")
+        cloud_arrays.refuse_jit("Model.render")
         lights = lights or [None] * len(views)
         for light in lights:
             check_light(light)
         draw = method_of(self.config).render
-        return draw(self.variables, volume, views, lights, config=self.config, quality=quality)
+        return draw(self.params, volume, views, lights, config=self.config, quality=quality)
 
     def camera(
         self,
-        volume: Volume | SurfelScene,
+        volume: Encoded,
         azimuth: Angle = 30.0,
         elevation: Angle = 20.0,
         resolution: int | None = None,
@@ -120,19 +133,11 @@ class Model:
 
         Pure: angles and volume may be traced.
         """
-        check_kind(volume, Volume | SurfelScene, "camera: expected what Model.encode or spnr_jax.encode returns")
+        check_kind(volume, Encoded, "camera: expected what Model.encode or spnr_jax.encode returns")
         size = self.config.image_resolution if resolution is None else resolution
         if not isinstance(size, int | np.integer) or size < 1:
             raise UserError(f"camera: resolution={size} is no number of pixels; `cameras.resize` makes other shapes")
         return _orbit(azimuth, elevation, volume.centre, volume.scale, size=size)
-
-    @property
-    def params(self) -> dict:
-        """The variables: the first argument of `spnr_jax.encode` and `spnr_jax.render`.
-
-        The shader's weights are in `params["params"]`, as Flax has it, and the densifier's in `params["densifier"]`.
-        """
-        return self.variables
 
 
 def render_views(

@@ -264,12 +264,12 @@ def union_weights(
 # --- the functions of the method --------------------------------------------------------------------------------------
 
 
-def encode_volume(
+def encode_object(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: PaperConfig
 ) -> Volume:
     """Volume of a cloud in the box (unbatched), and how far from its points rays are sampled."""
     reach = estimate_reach(np.asarray(cloud.positions)[np.asarray(cloud.mask)], config.encoder.volume_resolution)
-    volume = inference.encode_volume(variables, cloud, centre, scale, config=config)
+    volume = inference.encode_object(variables, cloud, centre, scale, config=config)
     return dataclasses.replace(volume, reach=reach)
 
 

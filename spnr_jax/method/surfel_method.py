@@ -20,7 +20,7 @@ from spnr_jax.devices.runtime import QUICK, QUICKEST, two_at_a_time
 from spnr_jax.kernels import cameras, cloud_arrays
 from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
-from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene
 from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.checks import check_camera
 from spnr_jax.method.surfel_renderer import Plan, make_scene
@@ -47,13 +47,12 @@ def init(key: Key, config: SurfelConfig) -> dict:
     return dict(Shader(config.widths, config.top).init(key, jnp.zeros((1, side, side, shader.NUM_FEATURES)), 1))
 
 
-def encode_volume(
+def encode_object(
     variables: dict, cloud: PointCloud, centre: np.ndarray, scale: np.floating, *, config: SurfelConfig
-) -> Volume:
-    """Volume of a cloud in the box (unbatched); sparse clouds get learned points."""
+) -> SurfelScene:
+    """Scene of a cloud in the box (unbatched); sparse clouds get learned points."""
     scene = encode_in_box(densify_sparse(variables, cloud))
-    scene = dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
-    return Volume(scene=scene, centre=scene.centre, scale=scene.scale)
+    return dataclasses.replace(scene, centre=jnp.asarray(centre), scale=jnp.asarray(scale))
 
 
 def encode_in_box(cloud: PointCloud, least: int = SMALLEST_BUCKET) -> SurfelScene:
@@ -85,7 +84,7 @@ def densify_sparse(variables: dict, cloud: PointCloud, least: int = SMALLEST_BUC
 
 def render_each(
     variables: dict,
-    volume: Volume,
+    scene: SurfelScene,
     views: Sequence[Camera],
     lights: Sequence[Light | None],
     *,
@@ -94,17 +93,17 @@ def render_each(
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
     weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
-    planned = [plan_view(volume.scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
+    planned = [plan_view(scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     resolutions = {view.needed[:2] for view in planned}
     plans = {of: surfel_renderer.merge_plans(x.needed for x in planned if x.needed[:2] == of) for of in resolutions}
 
     def draw(view: PlannedView, whole: Camera) -> Rendering:
         if view.needed.entries:
             plan = plans[view.needed[:2]]
-            window_buffer = _rasterize(volume.scene, view.camera, view.light, plan=plan)
-            drawn = _shade(weights, volume.scene, view.camera, view.light, window_buffer, plan=plan)
+            window_buffer = _rasterize(scene, view.camera, view.light, plan=plan)
+            drawn = _shade(weights, scene, view.camera, view.light, window_buffer, plan=plan)
         else:
-            drawn = _leave_empty(volume.scene, view.camera)
+            drawn = _leave_empty(scene, view.camera)
         return drawn if render_scale == 1 else _enlarge(drawn, whole.height, whole.width)
 
     yield from two_at_a_time(lambda both: draw(*both), zip(planned, views, strict=True))

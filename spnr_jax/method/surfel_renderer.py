@@ -150,19 +150,17 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
     check_scene(scene, "plan")
     cloud_arrays.refuse_tracers(scene, "plan")
     check_camera(camera, "plan")
-    batch = np.shape(camera.cam_to_world)[:-2]
-    objects = np.shape(scene.spacing)
-    if batch[: len(objects)] != objects:
-        if batch:
-            raise UserError(f"scenes of axes {objects} need cameras of the same leading axes, or of none; got {batch}")
-        camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (*objects, *x.shape)), camera)
-        batch = objects
-    camera = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[-2:])), camera)
-    each = int(np.prod(batch[len(objects) :], dtype=int))
-    scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
-    pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
-    doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # the finest
-    return merge_plans(jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs]))
+    batch, objects = np.shape(camera.cam_to_world)[:-2], np.shape(scene.spacing)
+    if batch and batch[: len(objects)] != objects:
+        raise UserError(f"scenes of axes {objects} need cameras of the same leading axes, or of none; got {batch}")
+    batch = batch or objects
+    with jax.ensure_compile_time_eval():  # arrays that a traced function closes over have values, too
+        camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[-2:])).reshape(-1, *x.shape[-2:]), camera)
+        each = int(np.prod(batch[len(objects) :], dtype=int))
+        scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
+        pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
+        doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # finest
+        return merge_plans(jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs]))
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
@@ -273,8 +271,10 @@ def _check_plan(plan: Plan) -> None:
     if any(isinstance(size, jax.core.Tracer) for size in jax.tree.leaves(plan)):
         raise UserError("render: plan is traced, but gives array sizes: jax.jit(render, static_argnames='plan')")
     check_kind(plan, Plan, "render: expected plan=spnr_jax.plan(scene, camera)")
-    if min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
-        raise UserError(f"render: {plan} has a size below 1, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
+    whole = all(isinstance(size, int) for size in plan)
+    if not whole or min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
+        found = "a size that is no whole number from 1 on"
+        raise UserError(f"render: {plan} has {found}, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")
 
 
 class WindowBuffer(NamedTuple):

@@ -127,7 +127,7 @@ def map_blocks(
     def compute(neighbors: Array, packed: Array) -> Array:
         positions, values = _unpack(packed, (points.position, own))
         out = work(layers.gather_neighborhoods(neighbors, positions, table), *values)
-        forms.append(out)
+        forms.append(jax.eval_shape(lambda: out))  # no traced values: they must not leave the function
         return _pack(out)
 
     def skip(neighbors: Array, packed: Array) -> Array:

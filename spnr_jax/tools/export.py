@@ -172,7 +172,7 @@ def export_network(options: Export) -> str:
         cloud = f"of a cloud `spnr export {options.run} --splats OUT.ply`"
         raise UserError(f"{options.run}: a file; expected a run folder, or {cloud}")
     trained, where, out = weights.read_trained(options.run), options.platforms, options.out
-    model = Model(config=trained.config.model, variables=trained.variables)
+    model = Model(config=trained.config.model, params=trained.variables)
     images.check_place(out / "weights.npz")
     points, size = options.num_points or 1024, options.resolution
     functions = {

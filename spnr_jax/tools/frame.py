@@ -21,7 +21,7 @@ from spnr_jax.config import Quality
 from spnr_jax.errors import UserError
 from spnr_jax.formats import images
 from spnr_jax.formats.images import NAMES, read_light
-from spnr_jax.kernels.records import Camera, Light, PointCloud, Volume
+from spnr_jax.kernels.records import Camera, Encoded, Light, PointCloud
 from spnr_jax.method.model import Model
 from spnr_jax.tools.commands import Background, Lighting, changed_options
 from spnr_jax.tools.pictures import light_of_options, put_background
@@ -56,7 +56,7 @@ class State:
 
     name: str
     cloud: PointCloud
-    volume: Volume
+    volume: Encoded
     view: View | None = None
     quality: str = "best"
     lighting: Lighting = Lighting()
@@ -160,7 +160,7 @@ def square_reach(view: View, whole: bool) -> float:
     return covering if furthest >= np.pi / 2 else min(covering, float(np.tan(furthest)))
 
 
-def square_camera(view: View, volume: Volume, reach: float, size: int) -> Camera:
+def square_camera(view: View, volume: Encoded, reach: float, size: int) -> Camera:
     """Camera of `size` x `size` pixels in the middle of a view, in the cloud's units."""
     focal = 0.5 * size / reach
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], np.float32)

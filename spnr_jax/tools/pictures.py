@@ -33,7 +33,7 @@ from spnr_jax.formats.clouds import PlacedCloud
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.cameras import camera_rays
 from spnr_jax.kernels.imaging import linear_to_srgb
-from spnr_jax.kernels.records import Camera, Light, Rendering, Volume
+from spnr_jax.kernels.records import Camera, Encoded, Light, Rendering
 from spnr_jax.method.model import Model
 from spnr_jax.methods import method_of
 from spnr_jax.surfels.lighting import look_up_background, room_light
@@ -87,7 +87,7 @@ class PreparedObject:
 
     placed: PlacedCloud
     model: Model
-    volume: Volume
+    volume: Encoded
     light: Light | None
     cameras: Sequence[Camera] = ()
 
@@ -167,7 +167,7 @@ def _draw(
         yield put_background(options.background, rendering, camera, light)
 
 
-def _write_still(stem: str, rendering: Rendering, camera: Camera, volume: Volume, options: Render) -> str:
+def _write_still(stem: str, rendering: Rendering, camera: Camera, volume: Encoded, options: Render) -> str:
     """Writes the files of one view; a line that names the first."""
     acc, files = np.asarray(rendering.acc), {}
     if "image" in options.outputs:
@@ -198,7 +198,7 @@ def straight_alpha(image: np.ndarray, acc: np.ndarray) -> np.ndarray:
     return np.concatenate([np.clip(np.where(alpha < INVISIBLE, 1, color), 0, 1), alpha], axis=-1)
 
 
-def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Volume) -> dict:
+def cameras_document(cameras: list[Camera], name: str, placed: PlacedCloud, volume: Encoded) -> dict:
     """The views in the nerfstudio convention, and the transform of the points: box = scale * (rotation p - centre)."""
     names = [f"{name}_{i:03d}.png" for i in range(len(cameras))]
     return describe_cameras(cameras, names, placed.rotation, placed.origin) | {

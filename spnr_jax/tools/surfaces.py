@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import Camera, Gaussians, Light, PointCloud, Rendering, SurfelScene, Volume
+from spnr_jax.kernels.records import Camera, Encoded, Gaussians, Light, PointCloud, Rendering, SurfelScene
 from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.surfels import gaussians
@@ -25,7 +25,7 @@ VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
 GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
 
 
-def surface_depth(rendering: Rendering, camera: Camera, volume: Volume) -> np.ndarray:
+def surface_depth(rendering: Rendering, camera: Camera, volume: Encoded) -> np.ndarray:
     """Distance (h, w) float32 along the ray to what is hit, in the cloud's units; NaN where nothing is."""
     depth, acc = np.asarray(rendering.depth, np.float64), np.asarray(rendering.acc, np.float64)
     far = np.asarray(_far(camera, volume.centre, volume.scale, size=depth.shape), np.float64)
@@ -42,7 +42,7 @@ def _far(
     return cameras.intersect_box((rays.origins - centre[None, None]) * scale, rays.directions)[1] / scale
 
 
-def draw_around(model: Model, volume: Volume, light: Light | None, count: int, resolution: int) -> list[View]:
+def draw_around(model: Model, volume: Encoded, light: Light | None, count: int, resolution: int) -> list[View]:
     """The network's pictures from even directions, from the top down along a spiral; the cameras are in the box."""
     heights = 1 - (2 * np.arange(count) + 1) / count
     angles = zip(np.arange(count) * GOLDEN_ANGLE % 360, np.degrees(np.arcsin(heights)), strict=True)
@@ -69,7 +69,7 @@ def splats(
     most: int = 150_000,
     views: int = VIEWS,
     resolution: int = RESOLUTION,
-    volume: Volume | None = None,
+    volume: Encoded | None = None,
 ) -> Gaussians:
     """Gaussian splats of a cloud as the network draws it, in the cloud's units, y up: what splat viewers show.
 
@@ -80,8 +80,9 @@ def splats(
     volume = model.encode(cloud) if volume is None else volume
     pictures = draw_around(model, volume, light, views, resolution)
     centre, scale = np.asarray(volume.centre), np.asarray(volume.scale)
-    scene = volume.scene
-    if not isinstance(scene, SurfelScene):
+    if isinstance(volume, SurfelScene):
+        scene = volume
+    else:
         inside = np.clip((np.asarray(cloud.positions) - centre) * scale, -1, 1).astype(np.float32)
         scene = encode_in_box(dataclasses.replace(cloud, positions=inside))
     focal = float(np.asarray(pictures[0].camera.intrinsics)[0, 0])

@@ -94,7 +94,7 @@ def load(run: Path | str | None = None, methods: Path | str | None = None) -> Mo
     if methods is not None:
         include(methods)
     trained = read_trained(run)
-    return Model(config=trained.config.model, variables=trained.variables)
+    return Model(config=trained.config.model, params=trained.variables)
 
 
 def write_weights(path: Path, trained: Trained) -> None:

@@ -21,11 +21,22 @@ CALLS = {
     "densify({'densifier': {}}, cloud, near[:8])": "densify: neighbors has the shape (8, 20), expected (9, 20)",
     "plan(scene, camera.replace(cam_to_world=np.eye(4)))": "plan: expected a pose (3, 4) and intrinsics (3, 3)",
     "plan(scene, camera.replace(intrinsics=np.full((3, 3), np.nan)))": "plan: the camera's pose or intrinsics hold NaN",
-    "plan(cloud, camera)": "plan: expected a scene of spnr_jax.encode, or volume.scene, got PointCloud",
+    "plan(cloud, camera)": "plan: expected a scene of spnr_jax.encode or Model.encode, got PointCloud",
     "render(None, scene, camera, 'studio', plan=plan(scene, camera))": "light: expected a Light, as spnr_jax.read",
     "plan(scene, camera.replace(intrinsics=-camera.intrinsics))": "plan: a focal length of camera.intrinsics is",
     "render(None, scene, camera, plan=None)": "render: expected plan=spnr_jax.plan(scene, camera), got NoneType",
-    "model.render(scene, camera)": "render: expected a volume of Model.encode, got SurfelScene",
+    "model.render(cloud, camera)": "render: expected what Model.encode returns, got PointCloud",
+    "model.render(some(scene), camera)": "render: expected one object, got a stack (1,); use jax.vmap",
+    "model.render(scene, some(some(camera)))": "render: expected one camera, or one axis of them, got axes (1, 1)",
+    "plan(scene, some(camera).replace(intrinsics=np.stack([camera.intrinsics] * 2)))": "plan: expected a pose (3, 4)",
+    "render(model, scene, camera, plan=plan(scene, camera))": "render: expected params=model.params, or None",
+    "render({'params': {}}, scene, camera, plan=plan(scene, camera))": "render: these params are of another network",
+    "densify(model, cloud, near)": "densify: expected model.params, got Model",
+    "render(None, scene, camera, plan=plan(scene, camera)._replace(slots=2.5))": "render: Plan(doublings=",
+    "encode(None, cloud.replace(base_color=None), near)": "encode: cloud.base_color is None, expected an array (9, 3)",
+    "encode(None, cloud.replace(positions=np.full((9, 3), np.nan)), near)": "encode: cloud.positions has NaN or inf",
+    "spnr_jax.cameras.pinhole(camera.cam_to_world, 40.0, 8, 8)": "pinhole: field_of_view=40 is not below pi",
+    "spnr_jax.voxels.scatter_mean(rows[0], rows[1, :, 0], cloud.mask, 4)": "scatter_mean: positions, features and mask",
     "model.render(volume, camera.replace(cam_to_world=np.eye(4)))": "render: expected a pose (3, 4) and intrinsics",
     "model.render(volume, camera.replace(cam_to_world=np.full((3, 4), np.nan)))": "render: the camera's pose or intri",
     "model.render(volume, camera.replace(intrinsics=-camera.intrinsics))": "render: a focal length of camera.intrin",
@@ -41,6 +52,8 @@ CALLS = {
     "jax.jit(lambda scene: plan(scene, camera))(scene)": "plan: runs on the host",
     "jax.jit(lambda camera: plan(scene, camera))(camera)": "plan: runs on the host",
     "jax.jit(lambda cloud: model.encode(cloud))(cloud)": "Model.encode: runs on the host",
+    "jax.jit(lambda x: x + model.encode(cloud).spacing)(0)": "Model.encode: runs on the host",
+    "jax.jit(lambda x: x + model.render(scene, camera).acc)(0)": "Model.render: runs on the host",
     "encode(None, cloud, near + 9)": "encode: neighbors are int32 from -1 to 17, expected indices of 9 points",
     "densify({'densifier': {}}, cloud, near - 1)": "densify: neighbors are int32 from -2 to 7, expected indices",
     "encode(None, cloud, near + 0.0)": "encode: neighbors are float64 from -1.0 to 8.0, expected indices",
@@ -74,10 +87,10 @@ CALLS = {
     "spnr_jax.clean(some(cloud))": "clean takes one cloud, positions (points, 3); got shape",
     "model.encode(jax.tree.map(lambda x: x[:0], cloud))": "encode: the cloud has no points",
     "model.encode(cloud.replace(mask=np.zeros(9, bool)))": "encode: the cloud has no points",
-    "model.encode(cloud.replace(positions=np.nan * rows[0]))": "the cloud has NaN or infinity in its positions",
-    "model.encode(cloud.replace(base_color=np.inf * rows[1]))": "the cloud has NaN or infinity in its base_color",
-    "model.encode(cloud.replace(roughness=np.nan * rows[2, :, 0]))": "the cloud has NaN or infinity in its roughness",
-    "model.encode(cloud.replace(metallic=np.inf * rows[2, :, 0]))": "the cloud has NaN or infinity in its metallic",
+    "model.encode(cloud.replace(positions=np.nan * rows[0]))": "encode: cloud.positions has NaN or infinity",
+    "model.encode(cloud.replace(base_color=np.inf * rows[1]))": "encode: cloud.base_color has NaN or infinity",
+    "model.encode(cloud.replace(roughness=np.nan * rows[2, :, 0]))": "encode: cloud.roughness has NaN or infinity",
+    "model.encode(cloud.replace(metallic=np.inf * rows[2, :, 0]))": "encode: cloud.metallic has NaN or infinity",
     "model.render(volume, camera, 'fast')": "quality must be one of draft, balanced, best, trained, got fast",
     "render(None, scene, some(camera), plan=plan(scene, camera))": "render: camera.cam_to_world has the shape (1, 3",
     "render(None, some(scene), camera, plan=plan(scene, camera))": "render: scene.centre has the shape (1, 3), expect",
@@ -96,7 +109,7 @@ cloud = make_cloud(*rows[:2], *rows[2:, :, 0])
 near, light, model = neighbors(cloud), spnr_jax.sun(40, 30), spnr_jax.load()
 scene = jax.jit(encode)(None, cloud, near)
 some = lambda tree: jax.tree.map(lambda x: x[None], tree)
-camera, volume = model.camera(scene, resolution=16), spnr_jax.Volume(scene, scene.centre, scene.scale)
+camera, volume = model.camera(scene, resolution=16), scene
 said = []
 for call in json.loads(sys.argv[1]):
     try:

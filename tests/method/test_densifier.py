@@ -213,6 +213,6 @@ def test_the_handle_densifies_sparse_clouds_alone(params, monkeypatch):
 
 
 def test_the_handle_encodes_the_points_alone_where_it_is_asked_to():
-    surfels = spnr_jax.load().encode(cloud(shape("sphere", 300)[0]), densify=False).scene.surfels
+    surfels = spnr_jax.load().encode(cloud(shape("sphere", 300)[0]), densify=False).surfels
     assert int(np.sum(surfels.mask)) == 300
     np.testing.assert_array_equal(surfels.learned, 0)

@@ -53,13 +53,16 @@ def test_an_axis_of_views_holds_what_each_camera_sees_alone(handle):
     together = handle.render(volume, jax.tree.map(lambda *x: jax.numpy.stack(x), *single))
     for i, camera in enumerate(single):
         close(jax.tree.map(lambda x, i=i: x[i], together), handle.render(volume, camera), atol=1e-5)
+    poses = np.stack([camera.cam_to_world for camera in single])
+    shared = handle.render(volume, single[0].replace(cam_to_world=poses))  # one lens for all views
+    jax.tree.map(np.testing.assert_array_equal, shared, together)
 
 
 def test_the_handle_shows_what_the_evaluation_shows(handle):
     item = data_sets.read_object(tiny_dataset.dataset(), "ball_000004")
-    expected = model.render_views(handle.variables, tiny_dataset.CONFIG.model, item.cloud, item.camera)
+    expected = model.render_views(handle.params, tiny_dataset.CONFIG.model, item.cloud, item.camera)
     encoded = tiny_model.encode(
-        handle.variables, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
+        handle.params, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], item.cloud), config=handle.config
     )
     scene = jax.tree.map(lambda x: x[0], encoded)
     volume = Volume(scene=scene, centre=jax.numpy.zeros(3), scale=jax.numpy.ones(()))

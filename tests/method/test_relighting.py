@@ -71,8 +71,8 @@ def test_object_camera_and_light_turned_together_give_nearly_the_same_picture(mo
 
     def drawn(volume, light, azimuth):
         if not shadowed:
-            surfels = volume.scene.surfels.replace(visibility=jnp.ones_like(volume.scene.surfels.visibility))
-            volume = volume.replace(scene=volume.scene.replace(surfels=surfels))
+            visibility = jnp.ones_like(volume.surfels.visibility)
+            volume = volume.replace(surfels=volume.surfels.replace(visibility=visibility))
         return linear(model, volume, light, azimuth)
 
     before, solid = drawn(volume, light, 30.0)

@@ -10,6 +10,7 @@ from support.laws import close, numbers
 from support.surfel_clouds import camera, cloud, shape
 
 from spnr_jax.config import SurfelConfig
+from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_method import encode_in_box
@@ -133,6 +134,28 @@ def test_a_plan_holds_every_view_and_every_object_it_is_made_of(scenes, views):
     assert plan(stacked(scenes), views[0]).entries == max(plan(s, views[0]).entries for s in scenes)
     with pytest.raises(ValueError, match="same leading axes"):
         plan(stacked([*scenes, scenes[0]]), stacked(views))
+
+
+def test_a_plan_of_what_a_jitted_function_closes_over_is_that_of_outside(params, scenes, views):
+    wanted = []
+
+    @jax.jit
+    def of_pose(pose):
+        wanted.append(plan(scenes[0], views[0]))
+        return render(params, scenes[0], views[0].replace(cam_to_world=pose), plan=wanted[0]).image
+
+    assert of_pose(views[0].cam_to_world).shape == (24, 24, 3)
+    assert wanted == [plan(scenes[0], views[0])]
+    shared = views[0].replace(cam_to_world=np.stack([x.cam_to_world for x in views[:2]]))
+    assert plan(scenes[0], shared) == plan(scenes[0], stacked(views[:2])), "one lens for all views"
+
+
+def test_nothing_traced_leaves_encode_and_padded_clouds_can_be_traced():
+    points = cloud(shape("sphere", 90)[0])
+    near = np.pad(neighbors(points), [(0, 38), (0, 0)], constant_values=-1)
+    with jax.checking_leaks():
+        made = jax.eval_shape(lambda points: encode(None, cloud_arrays.pad(points, 128), near), points)
+    assert made.surfels.mask.shape == (128,)
 
 
 def test_order_and_padding_of_the_points_do_not_matter(params, scenes, views, lights):

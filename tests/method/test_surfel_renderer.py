@@ -12,7 +12,7 @@ from support.surfel_clouds import camera, cloud, shape, surfels
 
 from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cameras
-from spnr_jax.kernels.records import SurfelScene, Volume
+from spnr_jax.kernels.records import SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.method.surfel_renderer import GRID, Plan, choose_resolution
@@ -26,9 +26,8 @@ RADIUS = 0.6
 
 def render(variables, scene, view, quality="best"):
     """As the handle draws it, without its network for None."""
-    volume = Volume(scene=scene, centre=scene.centre, scale=scene.scale)
     quality = "draft" if variables is None else quality
-    return next(surfel_method.render_each(variables or {}, volume, [view], [LIGHT], config=CONFIG, quality=quality))
+    return next(surfel_method.render_each(variables or {}, scene, [view], [LIGHT], config=CONFIG, quality=quality))
 
 
 @pytest.fixture(scope="module")

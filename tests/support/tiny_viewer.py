@@ -23,7 +23,7 @@ RED, BLUE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8)
 def surfels() -> Model:
     """A network over surfels, whose drafts are drawn without its CNN, which is untrained."""
     config = SurfelConfig(image_resolution=24, widths=(4, 6), top=4)
-    return Model(config=config, variables=jax.jit(surfel_method.init, static_argnums=1)(jax.random.key(0), config))
+    return Model(config=config, params=jax.jit(surfel_method.init, static_argnums=1)(jax.random.key(0), config))
 
 
 def ball(count: int = 400) -> PointCloud:

@@ -15,7 +15,7 @@ UNIT = 10.0  # half diagonal of the cloud, in its own units
 def scene():
     """Volume and camera of a cloud that is large and far from 0."""
     volume = Volume(scene=None, centre=np.float32([50, 0, -20]), scale=np.asarray(1 / UNIT, np.float32))
-    return volume, Model(config=MODEL, variables={}).camera(volume, 0.0, 0.0, 24)
+    return volume, Model(config=MODEL, params={}).camera(volume, 0.0, 0.0, 24)
 
 
 def rendering(depth, acc):
