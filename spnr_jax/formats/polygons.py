@@ -18,11 +18,10 @@ from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import RGB, Loading, Part, Texels, make_material
 from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
 from spnr_jax.formats.point_tables import load_text, open_text
-from spnr_jax.formats.row_files import Lists, read_elements, read_header
+from spnr_jax.formats.row_files import USED, Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
-PARTS_OF_PLY = {f"PLY element {name}" for name in ("vertex", "face", "tristrips")}
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(?:((?:ST|C|N)*)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
@@ -44,7 +43,7 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
         sizes, of_faces = np.full(len(corners) // 3, 3), {}
     texcoords = _texcoords(vertices, lists, corners, sizes)
     _note_loose(corners, len(vertices["x"]), loading)
-    loading.ignored |= {f"PLY element {name:.40}" for name, count, _ in header.elements if count} - PARTS_OF_PLY
+    loading.ignored |= {f"PLY element {name:.40}" for name, count, _ in header.elements if count and name not in USED}
     images = [loading.read_image(texture) for texture in header.textures] if texcoords is not None else []
     if texcoords is None or not any(images):
         textured = header.textures or any("texture" in name for name, *_ in header.elements)

@@ -36,6 +36,7 @@ TYPES = {
     **{"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
 FACES = ("face", "tristrips")  # elements that make a PLY a mesh
+USED = ("vertex", "camera", *FACES)  # elements that are read; of a camera its place (orientation.py)
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LIST = 2**20  # items
 PLY_LIMIT, PCD_LIMIT = 2**20, 2**16  # bytes of a header
@@ -180,7 +181,7 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
             found = read_elements(file, header, "chunk", "vertex")
             yield unpack_columns(found["chunk"][0], found["vertex"][0])
             return
-        if others := [name for name, count, _ in header.elements if count and name != "vertex"]:
+        if others := [name for name, count, _ in header.elements if count and name not in USED]:
             report(f"not read: the PLY elements {list_names(others)}")
         for _, columns, lists in element_pieces(file, header, "vertex"):
             fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}
