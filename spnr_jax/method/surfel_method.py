@@ -23,7 +23,7 @@ from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene
 from spnr_jax.method import densifier, surfel_renderer
 from spnr_jax.method.checks import check_camera
-from spnr_jax.method.surfel_renderer import Plan, make_scene
+from spnr_jax.method.surfel_renderer import Sizes, make_scene
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
 from spnr_jax.surfels import symmetry
@@ -34,11 +34,12 @@ BALANCED = 0.75  # of the pixels along a side are drawn, then enlarged: docs/lab
 
 
 class PlannedView(NamedTuple):
-    """A view with its light: the camera that is drawn (smaller for `balanced`), and the sizes that it needs."""
+    """A view with its light: the camera that is drawn (smaller for `balanced`), its resolution and sizes."""
 
     camera: Camera
     light: Light
-    needed: Plan
+    resolution: tuple[int, int]  # doublings and side of its plan
+    sizes: Sizes
 
 
 def init(key: Key, config: SurfelConfig) -> dict:
@@ -94,12 +95,14 @@ def render_each(
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
     weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     planned = [plan_view(scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
-    resolutions = {view.needed[:2] for view in planned}
-    plans = {of: surfel_renderer.merge_plans(x.needed for x in planned if x.needed[:2] == of) for of in resolutions}
+    plans = {
+        of: surfel_renderer.make_plan(*of, (view.sizes for view in planned if view.resolution == of))
+        for of in {view.resolution for view in planned}
+    }
 
     def draw(view: PlannedView, whole: Camera) -> Rendering:
-        if view.needed.entries:
-            plan = plans[view.needed[:2]]
+        if view.sizes.entries:
+            plan = plans[view.resolution]
             window_buffer = _rasterize(scene, view.camera, view.light, plan=plan)
             drawn = _shade(weights, scene, view.camera, view.light, window_buffer, plan=plan)
         else:
@@ -117,8 +120,8 @@ def plan_view(scene: SurfelScene, camera: Camera, light: Light | None, render_sc
             camera, *(max(round(render_scale * n / 4) * 4, 4) for n in (camera.height, camera.width))
         )
     doublings, side = surfel_renderer.choose_resolution(scene, camera, render_scale)
-    needed = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
-    return PlannedView(camera, light or room_light(), Plan(*map(int, needed)))
+    sizes = jax.device_get(surfel_renderer.count_sizes(scene, camera, doublings=doublings, side=side))
+    return PlannedView(camera, light or room_light(), (doublings, side), sizes)
 
 
 @partial(CachedProgram, options=QUICKEST)

@@ -73,7 +73,17 @@ class Plan(NamedTuple):
     slots: int
 
 
+class Sizes(NamedTuple):
+    """What one view needs: the window in pixels, pairs of disc and pixel, and covered pixels."""
+
+    width: Int[AnyArray, ""]
+    height: Int[AnyArray, ""]
+    entries: Int[AnyArray, ""]
+    slots: Int[AnyArray, ""]
+
+
 register(Plan)
+register(Sizes)
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -160,7 +170,8 @@ def plan(scene: SurfelScene, camera: Camera) -> Plan:
         scenes = unstack(jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(objects) :]), scene))
         pairs = [(scenes[i // each], view) for i, view in enumerate(unstack(camera))]
         doublings, side = min((choose_resolution(*pair) for pair in pairs), key=lambda of: (of[0], -of[1]))  # finest
-        return merge_plans(jax.device_get([count_sizes(*pair, doublings=doublings, side=side) for pair in pairs]))
+        counted = [count_sizes(*pair, doublings=doublings, side=side) for pair in pairs]
+        return make_plan(doublings, side, jax.device_get(counted))
 
 
 def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 1.0) -> tuple[int, int]:
@@ -178,24 +189,23 @@ def choose_resolution(scene: SurfelScene, camera: Camera, render_scale: float = 
 
 
 @CachedProgram
-def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Plan:
-    """What a view needs, as arrays; the covered pixels are bounded by the rectangles around the discs."""
+def count_sizes(scene: SurfelScene, camera: Camera, *, doublings: int, side: int) -> Sizes:
+    """What a view needs; the covered pixels are bounded by the rectangles around the discs."""
     wide = widen_camera(scene, camera, doublings, side)
     foot = splatting.project_discs(scene.surfels, wide)
     _, width, height = place_window(foot)
     slots = splatting.bound_covered_pixels(foot, wide)
-    sizes: Any = width, height, splatting.count_entries(foot.covered), slots
-    return Plan(doublings, side, *sizes)
+    return Sizes(width, height, splatting.count_entries(foot.covered), slots)
 
 
-def merge_plans(counted: Iterable[Plan]) -> Plan:
+def make_plan(doublings: int, side: int, counted: Iterable[Sizes]) -> Plan:
     """The plan that holds each of several views of one resolution.
 
     Numbers of entries and slots are rounded up to powers of the root of two, so that few programs are compiled.
     """
-    most = Plan(*(max(map(int, sizes)) for sizes in zip(*counted, strict=True)))
-    entries, slots = _round_count(most.entries, LEAST_ENTRIES), _round_count(most.slots, LEAST_SLOTS)
-    return most._replace(entries=entries, slots=min(slots, most.width * most.height))
+    width, height, entries, slots = (max(map(int, sizes)) for sizes in zip(*counted, strict=True))
+    entries, slots = _round_count(entries, LEAST_ENTRIES), min(_round_count(slots, LEAST_SLOTS), width * height)
+    return Plan(doublings, side, width, height, entries, slots)
 
 
 def _round_count(count: int, least: int) -> int:
