@@ -165,6 +165,8 @@ class Loading:
             parts = [part for part in name.split("/") if part not in ("", ".")]
             for start in range(len(parts)):
                 if place := _find(folder, [*below, *parts[start:]]):
+                    if below:
+                        self.say(f"found in a folder `{TEXTURES}`", about=repr(_printable(place.name)))
                     return place.read_bytes()
         self.go_on_without("names a file that is missing", repr(unquote(uri)), needed)
         return None
@@ -243,7 +245,7 @@ def _readings(name: str) -> Iterator[str]:
     yield name
     if _printable(name) != name:
         for page in CODE_PAGES:
-            with contextlib.suppress(UnicodeDecodeError):
+            with contextlib.suppress(UnicodeError):
                 yield name.encode("utf-8", "surrogateescape").decode(page)
 
 
@@ -254,13 +256,15 @@ def _printable(name: str) -> str:
 
 def _find(folder: Path, names: list[str]) -> Path | None:
     """The file at this path below a folder, ignoring letter case; exact names are preferred."""
-    for name in names:
-        if name == ".." or ":" in name or not folder.is_dir():
-            return None
-        exact = folder / name
-        alike = [] if exact.exists() else sorted(x for x in folder.iterdir() if x.name.casefold() == name.casefold())
-        folder = next(iter(alike), exact)
-    return folder if folder.is_file() else None
+    with contextlib.suppress(OSError, UnicodeError):  # a folder that cannot be listed, a name that cannot be one
+        for name in names:
+            if name == ".." or ":" in name or not folder.is_dir():
+                return None
+            exact, plain = folder / name, name.casefold()
+            alike = [] if exact.exists() else sorted(x for x in folder.iterdir() if x.name.casefold() == plain)
+            folder = next(iter(alike), exact)
+        return folder if folder.is_file() else None
+    return None
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------

@@ -51,6 +51,7 @@ MESH_POINTS = 4096  # points sampled on a mesh by default: the most that trainin
 MOST_EVEN = 2**14  # points that are spread evenly over a mesh, in seconds; more are drawn at random
 CAPACITY = 2**19  # points in memory; a random sample of larger files is kept while reading
 BROKEN = "NaN, infinity or too large a number"
+TEXT_MESHES = (".obj", ".off")  # numbers with any number of digits
 CUT_MESH = 2**18  # points sampled on a mesh before a part of it is cut out
 WHOLE = Cut()
 COARSEST_STEP = 2e-5  # of the extent: largest error of rounding to float32
@@ -240,10 +241,11 @@ def _spread(asset: Asset, kind: str, how: Reading) -> tuple[SurfacePoints, np.nd
     corners, report = np.stack(bounding_box(asset)), how.report
     vertices = np.concatenate([part.positions[np.unique(part.faces)] for part in asset.parts])
     check_rounding(vertices, report, of_mesh=True)
-    short = vertices.astype(np.float32)  # were they rounded to it?  If so, small coordinates have finer digits
-    coarse = np.spacing(np.abs(short).max()) / 64
-    rounded = (vertices == short).all() and (vertices % coarse).any()
-    check_steps(vertices, (short if rounded else vertices).T, report)
+    if kind not in TEXT_MESHES:
+        short = vertices.astype(np.float32)  # were they rounded to it?  If so, several axes have all of its digits
+        digits = vertices / np.spacing(np.abs(short).max(axis=0))
+        rounded = (vertices == short).all() and (digits % 2 == 1).any(axis=0).sum() > 1
+        check_steps(vertices, (short if rounded else vertices).T, report)
     if (origin := _find_origin(corners)).any():  # before anything is converted to float32
         asset = replace(asset, parts=tuple(replace(part, positions=part.positions - origin) for part in asset.parts))
     count = max(CUT_MESH if how.cut.is_given else 0, how.num_points or MESH_POINTS)

@@ -62,12 +62,10 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     looks: dict[str, Look] = {}
     for name in dict.fromkeys(text["usemtl"]):
         look, move = _look(name, library.get(name), loading) if name else (make_material(), UNMOVED)
-        if colors is not None and look is not None and look.base_color.ndim > 1:
-            loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
-        elif colors is not None and look is not None and np.ptp(look.base_color) == 0:
+        if colors is not None and look is not None and np.ptp(look.base_color) == 0:
             loading.ignored |= {"MTL Kd beside colours of the vertices"} if name in library else set()
             look = replace(look, base_color=np.ones(3, np.float32))  # Kd is a placeholder
-        elif colors is not None and look is not None:
+        elif colors is not None and look is not None and look.base_color.ndim == 1:
             loading.say("colours of the vertices multiply those of the material", about=repr(name))
         looks[name] = look, move
     parts = _parts(text, stack_columns(columns), colors, looks, loading)
@@ -83,7 +81,10 @@ def _parse(content: str) -> Rests:
     keywords = ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf", POLYPAINT)
     found: Rests = {keyword: [] for keyword in keywords}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
-    for line in re.sub(r"\\[ \t]*\r?\n", " ", content).splitlines():
+    content = content.replace("\r\n", "\n").replace("\r", "\n")
+    if "\\" in content:  # lines that go on in the next one
+        content = re.sub(r"(?m)^([^#\n][^\n]*)\\[ \t]*\n", r"\1 ", content)
+    for line in content.splitlines():
         keyword, rest = (*line.split(None, 1), "", "")[:2]
         if keyword == "f":
             words = rest.partition("#")[0].split()
@@ -165,10 +166,15 @@ def _parts(
     for code in np.unique(kind):
         material, move = list(looks.values())[code // 4]
         assert material is not None
-        own = colors if material.base_color.ndim == 1 else None
-        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=own)
+        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
         placed = moved(move) if code & 2 else None
-        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=placed))
+        part = replace(part, normals=normals if code & 1 else None, texcoords=placed)
+        if colors is not None and material.base_color.ndim > 1 and placed is None:
+            part = replace(part, material=replace(material, base_color=np.ones(3, np.float32)))
+        elif colors is not None and material.base_color.ndim > 1:
+            loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
+            part = replace(part, colors=None)
+        parts.append(part)
     return parts
 
 
@@ -230,7 +236,8 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
             maps[key] = texels
             wrap = "clamp" if options.get("clamp") == ["on"] else wrap
     ignored |= {f"MTL {key}" for key in entry if key not in READ | SILENT and entry[key].strip("0. ")}
-    color = np.array(_numbers(entry, "kd", 0.5, loading)[:3])  # one number is grey
+    levels = _numbers(entry, "kd", loading) or [0.5]
+    color = np.array(levels[:3] if len(levels) > 2 else levels[:1])  # one number is grey
     white = full_scale(color.dtype, float(color.max()), linear=bool(color.max() < 2))
     if white > 1:
         ignored.add(f"MTL Kd beyond 1 (taken as 0 to {white:g})")
@@ -239,32 +246,41 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
         if "kd" in entry and not np.all(color == 1):
             ignored.add("MTL Kd beside map_Kd")
         color = maps["map_kd"].values(RGB, "sRGB")
-    shiny, highlight = 0.5, max(_numbers(entry, "ns", 0.0, loading)[0], 0)
-    if "ns" in entry and "blender" in entry:
+    shiny, highlight = 0.5, _number(entry, "ns", -1.0, loading)
+    if highlight >= 0 and "blender" in entry:
         shiny = 1 - min(highlight / float(entry["blender"]), 1) ** 0.5
-    elif "ns" in entry and entry.get("illum") not in ("0", "1") and entry.get("ks", "1").strip("0. "):
+    elif highlight >= 0 and entry.get("illum") not in ("0", "1") and entry.get("ks", "1").strip("0. "):
         shiny = (2 / (highlight + 2)) ** 0.5
     roughness, metallic = (
-        maps[f"map_{key}"].values(0, "linear") if f"map_{key}" in maps else _numbers(entry, key, plain, loading)[0]
+        maps[f"map_{key}"].values(0, "linear") if f"map_{key}" in maps else _number(entry, key, plain, loading)
         for key, plain in (("pr", shiny), ("pm", 0.0))
     )
     material = make_material(color, roughness, metallic, wrap)
     return loading.cut_out(name, material, *_alpha(entry, maps.get("map_d"), loading)), move
 
 
-def _numbers(entry: dict[str, str], key: str, default: float, loading: Loading) -> list[float]:
-    """The numbers of a statement, also with decimal commas; the default if there is none, or if it cannot be read."""
-    try:
-        return [float(word) for word in entry.get(key, "").replace(",", ".").split()] or [default]
-    except ValueError:
-        loading.go_on_without("has a number in its MTL that cannot be read", repr(f"{key} {entry[key]}"))
-        return [default]
+def _numbers(entry: dict[str, str], key: str, loading: Loading) -> list[float]:
+    """The numbers of a statement behind its options, up to the first word; decimal commas are read, too."""
+    numbers: list[float] = []
+    for word in re.sub(r"-[A-Za-z]+", "", entry.get(key, "")).split():
+        try:
+            numbers.append(float(word.rstrip(",;").replace(",", ".")))
+        except ValueError:
+            break
+    if not numbers and entry.get(key):
+        loading.go_on_without("has no number in its MTL", repr(f"{key} {entry[key]}"))
+    return numbers
 
 
 def _pair(words: Sequence[str], default: float) -> tuple[float, float]:
     """The first two numbers of a map's option, or the default."""
     one, two, *_ = (*(float(word) for word in words if not word.isalpha()), default, default)
     return one, two
+
+
+def _number(entry: dict[str, str], key: str, default: float, loading: Loading) -> float:
+    """The first number of a statement, or the default."""
+    return next(iter(_numbers(entry, key, loading)), default)
 
 
 def _alpha(entry: dict[str, str], map_d: Texels | None, loading: Loading) -> tuple[str, np.ndarray, float | int | None]:
@@ -277,9 +293,8 @@ def _alpha(entry: dict[str, str], map_d: Texels | None, loading: Loading) -> tup
         own = entry["map_d"] != entry.get("map_kd") and np.ptp(encoded[..., :3], axis=-1).max() <= NEARLY_GREY
         alpha = map_d.values(0 if own and encoded[..., 3].min() == 255 else 3, "linear")
         return "map_d", alpha, assets.MOSTLY_OPAQUE
-    opaque = {"d": re.sub("-halo", "", entry.get("d", "")), "tr": entry.get("tr", "")}
-    if (opacity := _numbers(opaque, "d", 1.0, loading)[0]) < 1:
+    if (opacity := _number(entry, "d", 1.0, loading)) < 1:
         return f"d {opacity:g}", np.asarray(opacity), None
-    if 0 < (share := _numbers(opaque, "tr", 0.0, loading)[0]) < 1:
+    if 0 < (share := _number(entry, "tr", 0.0, loading)) < 1:
         return f"Tr {share:g}", np.asarray(1 - share), None
     return "", np.ones(()), None

@@ -93,7 +93,7 @@ def kind_of(path: Path) -> str:
     """
     suffix, known = path.suffix.lower(), f"one of {' '.join(KNOWN)}"
     if path.is_dir():
-        raise UserError(f"{path}: a folder; expected a file of {known}; {path}/* are all of its files")
+        raise UserError(f"{path}: a folder; expected a file of {known}")
     if path.exists() and not path.is_file():
         raise UserError(f"{path}: a pipe or a device; save what comes from it as a file")
     if not path.is_file():

@@ -75,21 +75,22 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
         numbered = ((number, _plain(line)) for number, line in enumerate(file, 1))
         head, counted = _read_head(numbered), Counter[str]()
         lines = _rows_of_numbers(head, numbered, counted)
-        words: set[int] = set()  # columns of words
+        words = {i for i, field in enumerate(head.fields) if not _is_number(field)}  # columns of words
+        number, first = head.first
+        broken = UserError(f"line {number}: expected {len(head.fields)} numbers, found {first[:SHOWN]!r}")
         names: tuple[str, ...] = ()
         while rows := list(islice(lines, PIECE_LINES)):
             counted["points"] += len(rows)
-            broken: UserError | None = None
             try:
                 table = _load_table(rows, head, words)
             except UserError as error:
                 if names:
                     raise
-                broken, words = error, _find_words(rows, head.delimiter)
+                broken, words = error, words | _find_words(rows, head.delimiter)
                 table = _load_table(rows, head, words)
             if not names:
                 names = _names(head.before, table, words, path.suffix.lower(), report)
-                if broken and {names[i] for i in words} & {*POSITION, *COLOR}:
+                if {names[i] for i in words} & {*POSITION, *COLOR}:
                     raise broken
                 names = _name_words(names, table, words)
                 _report_cut_numbers(names, table, report)
@@ -168,9 +169,10 @@ def _find_delimiter(before: list[str], row: str) -> str | None:
 
 
 def _find_words(rows: list[Line], delimiter: str | None) -> set[int]:
-    """The columns of which most fields are words, whatever the first row has there."""
+    """The columns of which most fields that are not empty are words, whatever the first row has there."""
     columns = zip(*(text.split(delimiter) for _, text in rows), strict=False)
-    return {i for i, fields in enumerate(columns) if sum(map(_is_number, fields)) < len(fields) / 2}
+    known = [[_is_number(x) for x in fields if x.strip().lower() not in ("", "nan")] for fields in columns]
+    return {i for i, numbers in enumerate(known) if sum(numbers) < len(numbers) / 2}
 
 
 def open_text(path: Path) -> TextIO:

@@ -8,6 +8,7 @@
         `n i j k ... [colour]`; colours also without the C
 """
 
+import contextlib
 import io
 import re
 from pathlib import Path
@@ -50,7 +51,9 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
         if texcoords is not None or "texcoord" in lists or textured:
             loading.ignored.add("texture coordinates")
         return colored_part(vertices, corners, sizes, of_faces, loading)
-    number = np.asarray(of_faces.get("texnumber", np.zeros(len(sizes))))
+    number = np.asarray(of_faces.get("texnumber", np.zeros(len(sizes))), np.int64)
+    if len(number) and (number.min(), number.max()) == (1, len(images)):  # counted from 1
+        number = number - 1
     wanted = [(image, number == i) for i, image in enumerate(images) if image is not None]
     parts = [
         _textured(useful(vertices), corners[np.repeat(own, sizes)], sizes[own], texcoords[np.repeat(own, sizes)], image)
@@ -162,8 +165,7 @@ def colored_part(
     if {"roughness", "metallic"} & columns.keys():
         loading.ignored.add("roughness and metallic of vertices")
     alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
-    found = colors_of(rename(of_faces)) if colors is None or not _varies(colors) else None
-    if found is not None and (colors is None or _varies(found[0])):
+    if (found := _face_colors(of_faces, colors)) is not None:
         loading.ignored |= set() if colors is None else {"the one colour of all vertices, beside those of faces"}
         normals, alpha = (None if x is None else x[faces.ravel()] for x in (normals, alpha))
         positions = positions[faces.ravel()]
@@ -174,6 +176,12 @@ def colored_part(
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]
 
 
-def _varies(colors: np.ndarray) -> bool:
-    """Whether colours (n, 3) are not all the same."""
-    return bool((colors != colors[:1]).any())
+def _face_colors(of_faces: Columns, colors: np.ndarray | None) -> tuple[np.ndarray, list[str]] | None:
+    """Colours (f, 3) of polygons, and lines about them, if those of the vertices (n, 3) are unknown, or one for all."""
+    columns = rename(of_faces)
+    if colors is None or (colors != colors[:1]).any():
+        return colors_of(columns) if colors is None else None
+    with contextlib.suppress(UserError):  # those of the vertices can be read
+        found = colors_of({name: columns[name] for name in SRGB if name in columns})
+        return found if found is not None and (found[0] != found[0][:1]).any() else None
+    return None

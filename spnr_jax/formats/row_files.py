@@ -305,7 +305,7 @@ def _pcd_header(file: BufferedIOBase) -> Header:
 
 def _count_pixels(entries: dict[str, list[str]]) -> int:
     """The number of points of a PCD header that names none: those of its rows and columns."""
-    return int(entries["WIDTH"][0]) * int((entries.get("HEIGHT") or ["1"])[0])
+    return int(entries["WIDTH"][0]) * max(int((entries.get("HEIGHT") or ["1"])[0]), 1)
 
 
 # --- compressed PCD ---------------------------------------------------------------------------------------------------

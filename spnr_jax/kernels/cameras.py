@@ -34,10 +34,10 @@ def look_at(
 def pinhole(cam_to_world: Float[Array, "*batch 3 4"], field_of_view: float, height: int, width: int) -> Camera:
     """Camera with a horizontal field of view in radians, square pixels and the principal point in the middle.
 
-    ValueError for a field of view of pi or more, as of degrees.
+    ValueError for a field of view beyond 0 to pi, as of degrees.
     """
     if isinstance(field_of_view, float | int | np.floating) and not 0 <= field_of_view < np.pi:
-        raise UserError(f"pinhole: field_of_view={field_of_view:g} is not below pi; expected radians")
+        raise UserError(f"pinhole: field_of_view={field_of_view:g} is not from 0 to pi; expected radians")
     focal = 0.5 * width / jnp.tan(0.5 * field_of_view)
     intrinsics = jnp.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
     intrinsics = jnp.broadcast_to(intrinsics, (*cam_to_world.shape[:-2], 3, 3))

@@ -57,7 +57,8 @@ def ears(corners: np.ndarray) -> np.ndarray:
         beside = flat[[j for j in left if j not in ear]][:, None] - flat[ear]
         inside = (edges[:, 0] * beside[..., 1] - edges[:, 1] * beside[..., 0] >= 0).all(axis=1)
         inside &= beside.any(axis=2).all(axis=1)  # corners in the place of one of the ear's are those of a bridge
-        if edges[0, 0] * edges[1, 1] > edges[0, 1] * edges[1, 0] and not inside.any():
+        convex = edges[0, 0] * edges[1, 1] > edges[0, 1] * edges[1, 0]
+        if (convex and not inside.any()) or not edges[0].any():  # or a corner that repeats the one before
             found.append(tuple(ear))
             left.pop(i)
             i, failed = max(i - 1, 0), 0  # earlier corners are still no ears

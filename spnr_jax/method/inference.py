@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
@@ -160,6 +160,7 @@ def render_each(
     options: RenderOptions | None = None,
 ) -> Iterator[Rendering]:
     """Views one after the other.  UserError for a light, or for odd sizes if the network doubles the resolution."""
+    check_kind(volume, Volume, "render: expected a volume of this network's Model.encode")
     del quality  # these networks have one quality; others choose theirs through `options`
     for view, light in zip(views, lights, strict=True):
         if light is not None:

@@ -22,7 +22,7 @@ from spnr_jax.kernels.cloud_arrays import SMALLEST_BUCKET
 from spnr_jax.kernels.imaging import enlarge
 from spnr_jax.kernels.records import Camera, Key, Light, PointCloud, Rendering, SurfelScene
 from spnr_jax.method import densifier, surfel_renderer
-from spnr_jax.method.checks import check_camera
+from spnr_jax.method.checks import check_camera, check_scene
 from spnr_jax.method.surfel_renderer import Sizes, make_scene
 from spnr_jax.nn import shader
 from spnr_jax.nn.shader import Shader
@@ -93,6 +93,7 @@ def render_each(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other; all use the sizes of the largest one, so that few programs are compiled."""
+    check_scene(scene, "render")
     weights, render_scale = (None if quality == "draft" else variables), (BALANCED if quality == "balanced" else 1.0)
     planned = [plan_view(scene, view, light, render_scale) for view, light in zip(views, lights, strict=True)]
     plans = {

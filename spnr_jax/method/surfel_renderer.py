@@ -281,7 +281,7 @@ def _check_plan(plan: Plan) -> None:
     if any(isinstance(size, jax.core.Tracer) for size in jax.tree.leaves(plan)):
         raise UserError("render: plan is traced, but gives array sizes: jax.jit(render, static_argnames='plan')")
     check_kind(plan, Plan, "render: expected plan=spnr_jax.plan(scene, camera)")
-    whole = all(isinstance(size, int) for size in plan)
+    whole = all(isinstance(size, int | np.integer) for size in plan)
     if not whole or min(plan) < 0 or min(plan[1:]) < 1 or plan.entries > MOST_ENTRIES:
         found = "a size that is no whole number from 1 on"
         raise UserError(f"render: {plan} has {found}, or more than {MOST_ENTRIES} entries; use spnr_jax.plan")

@@ -287,7 +287,11 @@ def test_a_line_says_what_looks_wrong_with_positions_and_normals_which_are_left_
 
 def test_a_mesh_of_short_floats_far_away_is_refused(tmp_path):
     with pytest.raises(ValueError, match="0.5 apart at best in float32, for an extent of 1; move them"):
-        read(write(tmp_path, "a.stl", stl(2, at=UTM + [0, 0, 0.1])))
+        read(write(tmp_path, "a.stl", stl(2, at=UTM + [0, 0.3, 0.1])))
+    ball = np.float32(BALL + [4_100_000.3, 520_000.7, 4_800_000.9]).reshape(-1, 3, 3)  # on the globe: all are rounded
+    body = b"".join(np.zeros(3, "<f4").tobytes() + triangle.tobytes() + b"\0\0" for triangle in ball)
+    with pytest.raises(ValueError, match="0.5 apart at best in float32"):
+        read(write(tmp_path, "a.stl", bytes(80) + len(ball).to_bytes(4, "little") + body))
 
 
 def test_a_mesh_far_away_with_whole_halves_is_not_taken_for_rounded(tmp_path):

@@ -9,6 +9,7 @@ from support.mesh_files import CORNERS, RGB, square_ply, stl
 from support.point_clouds import GREEN, LINEAR, read, write
 
 from spnr_jax.formats.clouds import read_cloud
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.triangles import ears
 
 
@@ -33,6 +34,17 @@ def test_a_polygon_with_a_bridge_to_its_hole_leaves_the_hole_empty_wherever_it_b
         assert np.abs(np.cross(b - a, c - a)[:, 2]).sum() / 2 == pytest.approx(16 - 4)
         middles = ((a + b + c) / 3)[np.abs(np.cross(b - a, c - a)[:, 2]) > 0]
         assert not (np.abs(middles[:, :2] - 2) < 1).all(axis=1).any()
+
+
+def test_corners_of_a_polygon_that_are_named_twice_change_nothing():
+    angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    star = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * np.where(np.arange(10) % 2, 0.4, 1)[:, None]
+    for number in range(20):
+        doubled = np.repeat(star, 1 + np.random.default_rng(number).integers(0, 2, 10), axis=0)
+        a, b, c = np.moveaxis(doubled[ears(doubled)], 1, 0)
+        twice = np.cross(b - a, c - a)[:, 2]
+        assert (twice > -1e-12).all()
+        assert twice.sum() == pytest.approx(np.cross(star, np.roll(star, -1, axis=0))[:, 2].sum())
 
 
 def test_a_wavy_polygon_of_many_corners_keeps_its_area():
@@ -128,6 +140,17 @@ def test_images_in_a_folder_of_textures_in_or_beside_that_of_the_mesh_are_found(
     cloud, lines = read(textured_obj(folder, image, f"newmtl a\nmap_Kd {name}\n".encode()), num_points=20)
     assert is_green(cloud)
     assert not any("missing" in line for line in lines)
+    directly = name.startswith("../textures") and image.startswith("textures")
+    assert directly or "found in a folder `textures`: 'wood.png'" in lines
+
+
+def test_a_folder_that_cannot_be_listed_costs_no_mesh(tmp_path, monkeypatch):
+    def refuse(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    path = textured_obj(tmp_path, "wood.png", b"newmtl a\nmap_Kd gone.png\n")
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    assert "plain values taken where it names a file that is missing: 'gone.png'" in read(path, num_points=5)[1]
 
 
 def test_colours_of_vertices_do_not_darken_the_texture_beside_them(tmp_path):
@@ -136,17 +159,43 @@ def test_colours_of_vertices_do_not_darken_the_texture_beside_them(tmp_path):
     cloud, lines = read(path, num_points=20)
     assert is_green(cloud)
     assert "colours of the vertices not used beside those of a texture" in lines
+    own, (path, text) = [0.2, 0.6, 0.3], (path, path.read_text())
+    Image.new("RGB", (4, 4), "white").save(tmp_path / "wood.png")  # a placeholder
+    for content in (text, text.replace("1/1 2/2 3/3 4/4", "1 2 3 4")):
+        cloud = read_cloud(write(tmp_path, "a.obj", content), num_points=20)
+        np.testing.assert_allclose(
+            cloud.base_color, np.broadcast_to(srgb_to_linear(np.float32(own)), (20, 3)), atol=2e-3
+        )
 
 
 def test_numbers_of_a_library_have_decimal_commas_and_those_that_are_words_cost_no_mesh(tmp_path):
     text = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\nf 1 2 3 4\n"
     write(tmp_path, "a.obj", text)
-    cases = {"Kd 0,25 0 1\nNs\nd\n": ([0.25, 0, 1], False), "Kd xyz 0.1 0.2 0.3": ([0.5, 0.5, 0.5], True)}
+    cases = {
+        "Kd 0,25 0 1\nNs\nd\n": ([0.25, 0, 1], False),
+        "Kd 0.25, 0, 1\nNs many": ([0.25, 0, 1], True),
+        "Kd 0.25 0 1 factor 2\nKe x": ([0.25, 0, 1], False),
+        "Kd 0.25 0": ([0.25, 0.25, 0.25], False),
+        "Kd xyz 0.1 0.2 0.3": ([0.5, 0.5, 0.5], True),
+    }
     for mtl, (color, said) in cases.items():
         write(tmp_path, "a.mtl", f"newmtl a\n{mtl}")
         cloud, lines = read(tmp_path / "a.obj", num_points=5)
-        np.testing.assert_array_equal(cloud.base_color, np.broadcast_to(color, (5, 3)))
-        assert any("has a number in its MTL that cannot be read: 'kd xyz 0.1 0.2 0.3'" in x for x in lines) == said
+        np.testing.assert_array_equal(cloud.base_color, np.broadcast_to(np.float32(color), (5, 3)))
+        np.testing.assert_array_equal(cloud.roughness, 0.5)
+        assert any("has no number in its MTL: " in line for line in lines) == said
+    write(tmp_path, "a.mtl", "newmtl a\nd -HALO 0.5\n")
+    assert any("transparent parts drawn as opaque" in line for line in read(tmp_path / "a.obj", num_points=5)[1])
+
+
+def test_an_obj_goes_on_in_the_next_line_behind_a_backslash_but_not_in_a_remark(tmp_path):
+    write(tmp_path, "a.mtl", "newmtl a\nKd 0 0 1\n")
+    text = "# from C:\\folder\\ \nmtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS)
+    text += "usemtl a\nf 1 \\\n2 3 \\ \n4\n"
+    for newline in ("\n", "\r\n", "\r"):
+        cloud = read_cloud(write(tmp_path, "a.obj", text.replace("\n", newline)), num_points=50)
+        np.testing.assert_array_equal(cloud.base_color, np.broadcast_to([0, 0, 1], (50, 3)))
+        assert np.ptp(cloud.positions, axis=0) == pytest.approx([1, 1, 0], abs=0.2)
 
 
 PLY_HEAD = "ply\nformat ascii 1.0\n{}element vertex 8\n" + "".join(f"property float {x}\n" for x in "xyz")
@@ -174,6 +223,9 @@ def test_faces_of_a_ply_that_show_no_image_are_drawn_in_their_own_colours(tmp_pa
         assert is_green(cloud.replace(base_color=cloud.base_color[low]))
         assert (cloud.base_color[~low] == 0.5).all()
         assert "1 of 2 faces show no image of the file: their own colours taken" in lines
+    faces = [f"{uv} 1", f"{uv} 1"]  # counted from 1
+    path = write(tmp_path, "a.ply", two_squares_ply("comment TextureFile wood.png\n", "", of_face, "", faces))
+    assert is_green(read_cloud(path, num_points=50))
 
 
 def test_colours_of_faces_count_if_all_vertices_have_the_same(tmp_path):
@@ -182,6 +234,11 @@ def test_colours_of_faces_count_if_all_vertices_have_the_same(tmp_path):
     cloud, lines = read(write(tmp_path, "a.ply", content), num_points=50)
     np.testing.assert_array_equal(cloud.base_color, np.where(cloud.positions[:, 2:] < 1, [1, 0, 0], [0, 0, 1]))
     assert any("the one colour of all vertices, beside those of faces" in line for line in lines)
+    labels = "property int rgb\n", ["1", "2"]
+    for of_face, faces in ((colors.replace("uchar", "int"), ["-1 0 0", "0 0 1"]), labels):
+        content = two_squares_ply("", colors, of_face, "255 0 0", faces)
+        cloud = read_cloud(write(tmp_path, "a.ply", content), num_points=50)
+        np.testing.assert_array_equal(cloud.base_color, np.broadcast_to([1, 0, 0], (50, 3)))
 
 
 def test_lines_and_other_elements_that_are_not_read_are_said(tmp_path):

@@ -169,7 +169,15 @@ def repeat(document):
 
 
 TRANSMISSION = {"KHR_materials_transmission": {"transmissionFactor": 0.5}}
-OUTSIDE = "../secret.png", "a/../../secret.png", "/etc/hostname", "..%2fsecret.png", "file:///x", "C:\\x.png"
+OUTSIDE = (
+    "../secret.png",
+    "a/../../secret.png",
+    "/etc/hostname",
+    "..%2fsecret.png",
+    "file:///x",
+    "C:\\x.png",
+    "w\ud83d.png",
+)
 REFUSED = (
     (glass(alphaMode="BLEND"), "is transparent: material 'glass' has alphaMode BLEND"),
     (glass(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),

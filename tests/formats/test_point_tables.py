@@ -43,6 +43,7 @@ HASHED = [("#" * (i % 2) + str(i), *point) for i, point in enumerate(POINTS)]
 MILLIMETRES = "".join(",".join(f'"{x:,}"' for x in row) + "\n" for row in BALL_IN_MILLIMETRES.tolist())
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
+SPARSE = "".join(f"{row},{'' if i % 4 else 'chair'}\n" for i, row in enumerate(table(",").splitlines()))
 TEXTS = {
     "tabs and empty lines": ("a.tsv", table("\t", "\n")),
     "a byte order mark": ("a.csv", "\ufeffX;Y;Z;R;G;B\n" + table(";")),
@@ -82,6 +83,12 @@ TEXTS = {
         "i,x,y,z,r,g,b\nP,null,1,1,1,2,3\n" + WORDY.split("\n", 1)[1],
     ),
     "a label that is empty, then words": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,\n" + table(",", ",car")),
+    "labels here and there": ("a.csv", "x,y,z,r,g,b,name\n" + SPARSE),
+    "labels here and there, not in the first row": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,\n" + SPARSE),
+    "numbers of points of which the first has a letter": (
+        "a.csv",
+        "x,y,z,r,g,b,name\n9,nan,9,1,2,3,A1\n" + table(",", ",12"),
+    ),
     "names behind a word": ("a.txt", "# columns: b g r z y x\n" + table(" ", columns=BACKWARDS)),
     "names in brackets": ("a.txt", "# ['b', 'g', 'r', 'z', 'y', 'x']\n" + table(" ", columns=BACKWARDS)),
     "names behind a semicolon": ("a.txt", "; b g r z y x\n" + table(" ", columns=BACKWARDS)),

@@ -57,6 +57,8 @@ def test_a_pcd_without_a_number_of_points_has_its_rows_times_its_columns(tmp_pat
     header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 4\nDATA ascii\n"
     path = write(tmp_path, "a.pcd", header + "".join(f"{i % 3} {i // 3} {i % 2}\n" for i in range(12)))
     assert len(clouds.read_cloud(path).positions) == 12
+    write(tmp_path, "a.pcd", path.read_text().replace("WIDTH 3\nHEIGHT 4", "WIDTH 12\nHEIGHT 0"))
+    assert len(clouds.read_cloud(path).positions) == 12
 
 
 @pytest.mark.parametrize("name", ANNOUNCED)
