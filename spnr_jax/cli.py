@@ -113,13 +113,13 @@ def run_evaluate(command: Evaluate) -> None:
     start = time.monotonic()
     dataset = data_sets.open_dataset(command.data)
     out = command.out or (command.run.with_suffix("") if command.run.suffix == ".npz" else command.run)
-    if out != command.run:
+    if out != command.run or out.is_dir():  # else it is no run
         check_place(out / "metrics.json")
     outcome = evaluation.evaluate(command.run, dataset, command.split, command.gallery)
     seconds = dict.fromkeys(("evaluate", "total"), round(time.monotonic() - start, 1))
-    write_results(out, outcome, dataset.settings, seconds)
     print(f"{len(dataset.splits[command.split])} {describe_split(outcome.summary)}")
-    print("\n".join(text_table(outcome.summary["methods"])))
+    print("\n".join(text_table(outcome.summary["methods"])), flush=True)
+    write_results(out, outcome, dataset.settings, seconds)
     print(f"wrote {out / 'metrics.json'} and {out / 'report.html'}")
 
 

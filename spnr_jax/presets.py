@@ -1,7 +1,7 @@
 """The presets: functions that return a TrainConfig; `spnr train --preset` takes their names.
 
 First the paper's network in its published sizes and in smaller ones, then our surfel network.  The package's network
-was trained with the preset `surfels` (docs/model_card.md).
+has the shape of the preset `surfels`; how it was trained: docs/lab/surfels.md.
 """
 
 import dataclasses

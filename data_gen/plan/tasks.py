@@ -25,6 +25,7 @@ from data_gen import procedural
 from data_gen.plan import sources
 from data_gen.plan.sources import Category
 from spnr_jax.errors import UserError, require_at_least
+from spnr_jax.formats.columns import list_names
 from spnr_jax.formats.surface_points import Spread
 
 DEFAULT_OBJECTS = 200
@@ -240,11 +241,12 @@ def plan_data_set(config: GenerateConfig) -> Plan:
 def read_test_list(path: Path, known: set[str]) -> tuple[str, ...]:
     """The sorted ids of a text file with one id per line; ValueError if it names an object that is not there."""
     try:
-        ids = sorted(set(path.read_text().split()))
+        ids = sorted({line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()} - {""})
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"--test-list {path}: not a readable text file ({error})") from None
     if unknown := [name for name in ids if name not in known]:
-        raise UserError(f"--test-list {path}: no object {unknown[0]} ({len(unknown)} of {len(ids)} ids unknown)")
+        found = f"no object {unknown[0]!r} ({len(unknown)} of {len(ids)} ids unknown)"
+        raise UserError(f"--test-list {path}: {found}; ids are {list_names(sorted(known))}")
     return tuple(ids)
 
 

@@ -3,6 +3,8 @@
 Per object: its pictures, its condition images, and its points as a front view in base colour, roughness and metallic.
 """
 
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,12 +47,21 @@ def show(config: ShowConfig) -> Path:
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
     page = template(Path(__file__).with_name("contact_sheet.html")).render(
         title=f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects",
-        objects=(shown(config.dataset, object_ids[index]) for index in chosen),
+        objects=list(shown_objects(config.dataset, [object_ids[index] for index in chosen])),
     )
     path = config.to or config.dataset / "contact_sheet.html"
     write_whole(path, page.encode())
     print(path)
     return path
+
+
+def shown_objects(dataset: Path, names: list[str]) -> Iterator[dict]:
+    """The objects as the page shows them, without damaged ones, which are named on stderr."""
+    for name in names:
+        try:
+            yield shown(dataset, name)
+        except UserError as error:
+            print(f"left out: {error}", file=sys.stderr)
 
 
 def shown(dataset: Path, object_id: str) -> dict:

@@ -162,5 +162,5 @@ def check_resolution(data: ObjectData, config: TrainConfig) -> None:
     if (data.camera.height, data.camera.width) != (size, size):
         raise UserError(
             f"object {data.name} has images of {data.camera.width} x {data.camera.height} pixels, preset "
-            f"{config.preset} needs {size} x {size}; generate with --resolution {size}, or train another size"
+            f"{config.preset} needs {size} x {size}; generate with --resolution {size}"
         )

@@ -102,6 +102,9 @@ def _in_its_place(path: Path) -> Iterator[Path]:
     try:
         yield unfinished
         os.replace(unfinished, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # errors of writing name no file
+        raise
     finally:
         unfinished.unlink(missing_ok=True)
 

@@ -29,16 +29,17 @@ from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
-from spnr_jax.kernels.cameras import camera_rays
+from spnr_jax.kernels.cameras import camera_rays, resize
 from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, metric_settings, summarise
+from spnr_jax.training.gbuffers import average_squares
 from spnr_jax.training.weights import Trained, read_trained
 
 RADIUS_FACTORS = (0.5, 0.75, 1.0, 1.5, 2.0)
-RADIUS_OBJECTS = 8  # training objects on which one of them is chosen
+RADIUS_OBJECTS, RADIUS_PIXELS = 8, 128  # training objects, and size of their pictures, on which one of them is chosen
 TRIVIAL = ("white", "splat", "nearest")  # the trivial renderers above
 BLOCK = 2**19  # pairs of a ray (or point) and a point in memory at once, per view: 6 MB
 
@@ -86,9 +87,9 @@ def _score(
 
 
 def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) -> float:
-    """The radius factor with the highest PSNR over a few training objects."""
+    """The radius factor with the highest PSNR over a few training objects, at RADIUS_PIXELS or nearly."""
     names = dataset.splits["train"][:RADIUS_OBJECTS]
-    items = [_thin(data_sets.read_object(dataset, name), config) for name in names]
+    items = [shrink(_thin(data_sets.read_object(dataset, name), config)) for name in names]
     if not items:
         raise UserError(f"{dataset.folder}: no training objects to choose the radius of `{method}` on; generate some")
 
@@ -98,6 +99,16 @@ def choose_radius(dataset: data_sets.Dataset, config: TrainConfig, method: str) 
         return float(np.mean([metrics.psnr(image, reference) for image, reference in pairs]))
 
     return max(RADIUS_FACTORS, key=mean_psnr)
+
+
+def shrink(item: data_sets.ObjectData) -> data_sets.ObjectData:
+    """The object with pictures of at most RADIUS_PIXELS along a side, if means of whole pixels make such."""
+    height, width = item.images.shape[1:3]
+    side = next(n for n in range(max(height // RADIUS_PIXELS, 1), 0, -1) if not (height % n or width % n))
+    if side == 1:
+        return item
+    images = np.stack([average_squares(image, side) for image in item.images])
+    return dataclasses.replace(item, images=images, camera=resize(item.camera, height // side, width // side))
 
 
 def _thin(item: data_sets.ObjectData, config: TrainConfig) -> data_sets.ObjectData:
@@ -144,17 +155,22 @@ def _draw_trivial(cloud: PointCloud, camera: Camera, radius: Float[Array, ""], *
 
 def evaluate_object(methods: dict[str, Draw], config: TrainConfig, item: data_sets.ObjectData) -> ObjectResult:
     """Pictures and scores of one object."""
+    check_scorable(item, config)
+    item, pictures, scores = _thin(item, config), {}, {}
+    for method, show in methods.items():
+        pictures[method] = to_numpy(show(item))
+        scores[method] = _score_pictures(item, pictures[method])
+    return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
+
+
+def check_scorable(item: data_sets.ObjectData, config: TrainConfig) -> None:
+    """ValueError for pictures of another size than the network's, or with a light each."""
     if not config.model.any_size:
         data_sets.check_resolution(item, config)
     if item.lights is not None:
         raise UserError(
             f"object {item.name}: each view has its own light; `experiments.studies.relighting` scores those"
         )
-    item, pictures, scores = _thin(item, config), {}, {}
-    for method, show in methods.items():
-        pictures[method] = to_numpy(show(item))
-        scores[method] = _score_pictures(item, pictures[method])
-    return ObjectResult(name=item.name, reference=data_sets.on_white(item.images), pictures=pictures, scores=scores)
 
 
 def _score_pictures(item: data_sets.ObjectData, pictures: Pictures) -> Scores:
@@ -245,6 +261,8 @@ def compare(
         )
     for one in trained.values():
         check_known_light(one.config.model, dataset)
+    check_scorable(data_sets.read_object(dataset, names[0]), config)
+    say("choosing the radius of the points for the trivial methods")
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
     methods |= {name: make_trivial(name, factors.get(name, 1.0)) for name in TRIVIAL}

@@ -195,8 +195,8 @@ def text_table(methods: Mapping[str, Mapping]) -> list[str]:
     lines = []
     for method, row in methods.items():
         texts = [
-            f"{head.partition(',')[0]} {number(row[name], decimals, missing=MISSING.get(name, 'n/a')).text}"
-            for name, (head, decimals, _) in QUALITY.items()
+            f"{column.partition(',')[0]} {number(row[name], decimals, missing=MISSING.get(name, 'n/a')).text}"
+            for name, (column, decimals, _) in QUALITY.items()
         ]
         lines.append(f"{label(method):22s} " + "   ".join(texts))
     return lines

@@ -229,6 +229,9 @@ class Evaluate:
     gallery: int = 16
     """Objects shown in the report."""
 
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "gallery")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Export:

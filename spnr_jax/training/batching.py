@@ -83,7 +83,8 @@ def prepare(
 ) -> Callable[[int], Generator[Batch, None, None]]:
     """A function of a step: training batches of whole views from there on.
 
-    ValueError where the views have lights of their own: networks that are trained on them cannot be told which.
+    ValueError for data that do not suit, also where the views have lights of their own: these networks cannot be told
+    which.
     """
     del run, light
     if has_lights(dataset):
@@ -91,19 +92,20 @@ def prepare(
             f"{dataset.folder}: each view has a light of its own, and preset {config.preset} learns one light alone; "
             "train --preset surfels, or generate the data set without --lights"
         )
-    return lambda first_step: batches(dataset, config, first_step)
-
-
-def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator[Batch, None, None]:
-    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
-    names = dataset.splits["train"]
-    if not names:
+    if not (names := dataset.splits["train"]):
         raise UserError(f"{dataset.folder}: the train split is empty; generate more objects")
     if config.even_share and dataset.spread != "even":
         raise UserError(
             f"{dataset.folder}: its points are drawn at random, even_share is {config.even_share}; generate with "
             "--spread even, or use even_share 0"
         )
+    cached_reader(dataset, config)(names[0])
+    return lambda first_step: batches(dataset, config, first_step)
+
+
+def batches(dataset: Dataset, config: TrainConfig, first_step: int) -> Generator[Batch, None, None]:
+    """Training batches from `first_step` on, read and assembled ahead; an error is raised where its batch would be."""
+    names = dataset.splits["train"]
     read = cached_reader(dataset, config)
 
     def assemble(step: int) -> Batch:

@@ -110,7 +110,7 @@ def save(run: Path, state: optimisation.TrainState) -> None:
         number = re.search(r"os_error_code='(\d+)'", str(error))
         reason = os.strerror(int(number[1])) if number else first_line(error)
         raise UserError(
-            f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); the one before is kept: mend "
+            f"checkpoint {run / 'checkpoints' / str(step)} cannot be written ({reason}); earlier ones are kept: mend "
             "this, and the same command goes on from there"
         ) from None
     runtime.trim_memory()

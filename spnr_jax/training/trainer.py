@@ -10,6 +10,7 @@ import json
 import math
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, nullcontext
@@ -25,7 +26,7 @@ from tqdm import tqdm
 
 from spnr_jax.config import Schedule, TrainConfig
 from spnr_jax.devices import programs, runtime
-from spnr_jax.errors import UserError
+from spnr_jax.errors import STOPPED, UserError
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import png, to_uint8, write_whole
 from spnr_jax.kernels.metrics import psnr
@@ -36,6 +37,7 @@ from spnr_jax.training import checkpoint, optimisation
 from spnr_jax.training.weights import Trained, add_companions, write_weights
 
 PREVIEWED = 6  # objects of a preview
+NETWORK = "weights.npz"  # of a finished run
 GOES_ON = "the same command goes on from there"
 
 
@@ -64,9 +66,11 @@ def train(
     with checkpoint.lock_run(run), ExitStack() as stack:
         checkpoint.write_config(run, config)
         if not checkpoint.record_data(run, dataset):
-            tqdm.write(f"{run} began with another data set than {dataset.folder}, and goes on with this one")
+            tqdm.write(f"{run} was trained on another data set than {dataset.folder}, and goes on with this one")
         state = restore_or_init(config, run, mesh, init)
         if (first := int(state.step)) >= config.num_steps:
+            if not (run / NETWORK).exists():
+                write_network(run, config, state)
             return state
         batches = stack.enter_context(closing(batches_from(first)))  # may take long: a stop ends it at once
         requests = stack.enter_context(stop_requests())
@@ -117,6 +121,8 @@ def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Tra
     with programs.use_mesh(mesh):
         sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec())  # every device holds it whole
         state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
+        # as restored states are: else the step would be compiled once more for a run that goes on
+        state = jax.device_put(state, sharding or jax.local_devices()[0])
     if (step := int(state.step)) >= config.num_steps:
         tqdm.write(f"{run} is finished: {step} steps")
     elif step:
@@ -132,10 +138,10 @@ def new_state(config: TrainConfig, init: Trained | None) -> optimisation.TrainSt
 
 
 def write_network(run: Path, config: TrainConfig, state: optimisation.TrainState) -> None:
-    """Writes the averaged weights to RUN/weights.npz, and a message if they overflow float16."""
+    """Writes the averaged weights to RUN/NETWORK, and a message if they overflow float16."""
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     try:
-        write_weights(run / "weights.npz", Trained(config=config, variables=variables, steps=int(state.step)))
+        write_weights(run / NETWORK, Trained(config=config, variables=variables, steps=int(state.step)))
     except UserError as error:
         tqdm.write(str(error))
 
@@ -146,7 +152,7 @@ def check_finite(rows: list[tuple[int, dict]]) -> list[tuple[int, dict]]:
         for name, value in metrics.items():
             if not math.isfinite(value):
                 raise NotFinite(
-                    f"{name} is {float(value)} at step {step}; the last checkpoint is kept. Try a lower learning rate "
+                    f"{name} is {float(value)} at step {step}; earlier checkpoints are kept. Try a lower learning rate "
                     "or check the data with `spnr-data check`"
                 )
     return rows
@@ -165,12 +171,29 @@ def check_state(state: optimisation.TrainState) -> None:
 
 @contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """A list that is filled on Ctrl-C or SIGTERM: the loop then finishes its step, saves and stops."""
-    requests: list[int] = []
-    previous = {s: signal.signal(s, lambda number, _: requests.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    """A list that is filled on Ctrl-C or SIGTERM: the loop then finishes its step, saves and stops.
+
+    A second one ends the process at once, also while a step is compiled, when Python hears no signal: a thread does.
+    """
+    requests, heard = list[int](), (signal.SIGINT, signal.SIGTERM)
+    previous = {s: signal.signal(s, lambda number, _: requests.append(number)) for s in heard}
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    wakened = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def hear() -> None:
+        for count, _ in enumerate(number for number in iter(lambda: os.read(reader, 1), b"") if number[0] in heard):
+            if count:
+                os._exit(STOPPED)
+            os.write(2, b"\nstopping after this step; once more stops at once, at the last checkpoint\n")
+        os.close(reader)
+
+    threading.Thread(target=hear, daemon=True).start()
     try:
         yield requests
     finally:
+        signal.set_wakeup_fd(wakened)
+        os.close(writer)
         for number, handler in previous.items():
             signal.signal(number, handler)
 

@@ -1,3 +1,4 @@
+import errno
 import importlib.util
 import sys
 
@@ -47,11 +48,12 @@ def test_a_file_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(tmp_
     write_whole(path, b"old")
 
     def full(source, target):
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, "disk full")
 
     monkeypatch.setattr("os.replace", full)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OSError, match="disk full") as caught:
         write_whole(path, b"newer")
+    assert caught.value.filename == str(path), "the disk's own errors of writing name no file"
     assert path.read_bytes() == b"old"
     assert [p.name for p in path.parent.iterdir()] == ["a.bin"]
 

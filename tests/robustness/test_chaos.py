@@ -102,6 +102,6 @@ def test_a_second_training_in_one_folder_is_refused_until_the_first_is_over(tmp_
 def test_a_checkpoint_that_cannot_be_written_is_one_line_with_the_disks_reason(whole, tmp_path):
     _, state = checkpoint.load_run(whole)
     (tmp_path / "checkpoints").write_text("a file where the folder should be")
-    with pytest.raises(ValueError, match=r"checkpoints/40 cannot be written \(.*\); the one before is kept") as error:
+    with pytest.raises(ValueError, match=r"checkpoints/40 cannot be written \(.*\); earlier ones are kept") as error:
         checkpoint.save(tmp_path, dataclasses.replace(state, step=jax.numpy.full_like(state.step, 40)))
     assert "\n" not in str(error.value)

@@ -13,8 +13,8 @@ from support.tiny_untrained import CONFIG
 
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
-from spnr_jax.kernels.cameras import look_at
-from spnr_jax.kernels.records import Camera, PointCloud
+from spnr_jax.kernels.cameras import look_at, project
+from spnr_jax.kernels.records import Camera, PointCloud, unstack
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import METRICS, flip
 from spnr_jax.training import checkpoint, optimisation
@@ -88,6 +88,20 @@ def test_the_radius_is_the_one_that_scores_best_on_training_objects(monkeypatch)
 
     means = {factor: np.mean([score(factor, item) for item in items]) for factor in evaluation.RADIUS_FACTORS}
     assert means[chosen] == max(means.values())
+
+
+def test_radii_are_chosen_on_small_pictures_of_the_same_views(monkeypatch):
+    item = data_sets.read_object(tiny_dataset.dataset(), tiny_dataset.NAMES[0])
+    side = item.images.shape[1] // 2
+    monkeypatch.setattr(evaluation, "RADIUS_PIXELS", side)
+    small = evaluation.shrink(item)
+    assert small.images.shape[1:3] == (small.camera.height, small.camera.width) == (side, side)
+    points = jnp.asarray(item.cloud.positions)
+    for camera, less in zip(unstack(item.camera), unstack(small.camera), strict=True):
+        np.testing.assert_allclose(project(less, points)[0], project(camera, points)[0] / 2, rtol=1e-4, atol=1e-3)
+    white, less = data_sets.on_white(item.images), data_sets.on_white(small.images)
+    means = white.reshape(len(white), side, 2, side, 2, 3).mean(axis=(2, 4))
+    np.testing.assert_allclose(less, means, atol=0.02)
 
 
 def test_an_empty_training_split_is_an_error_that_names_it(tmp_path):

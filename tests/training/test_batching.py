@@ -74,11 +74,11 @@ def test_that_share_of_the_clouds_are_the_first_points(share):
     assert share == 0.5 or first == share
 
 
-def test_first_points_of_a_data_set_of_random_ones_are_refused_as_even():
+def test_first_points_of_a_data_set_of_random_ones_are_refused_as_even(tmp_path):
     dataset = tiny_dataset.dataset()
     config = replace(CONFIG, even_share=0.5)
     with pytest.raises(ValueError, match=f"{dataset.folder}: its points are drawn at random.*--spread even"):
-        next(batching.batches(dataset, config, 0))
+        batching.prepare(config, dataset, tmp_path, light=None)
     even = replace(dataset, settings={"settings": {"spread": "even"}})
     assert (dataset.spread, even.spread) == ("random", "even")
     with closing(batching.batches(even, config, 0)) as batches:

@@ -7,6 +7,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 from functools import partial
 
 import jax
@@ -97,6 +99,20 @@ def test_previews_and_rows_come_when_the_schedule_says_and_a_finished_run_is_lef
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
 
 
+def test_a_finished_run_that_lost_its_weights_gets_them_back(tmp_path):
+    run = shutil.copytree(tiny_dataset.run(), tmp_path / "run")
+    before = (run / "weights.npz").read_bytes()
+    (run / "weights.npz").unlink()
+    trainer.train(PLAIN, tiny_dataset.dataset(), run, SCHEDULE)
+    assert (run / "weights.npz").read_bytes() == before
+
+
+def test_a_fresh_state_lies_where_a_restored_one_does_so_that_a_run_that_goes_on_compiles_nothing_anew(tmp_path):
+    fresh = trainer.restore_or_init(PLAIN, tmp_path, None, None)
+    again = trainer.restore_or_init(PLAIN, tiny_dataset.run(), None, None)
+    assert all(jax.tree.leaves(jax.tree.map(lambda x, y: x.committed and x.sharding == y.sharding, fresh, again)))
+
+
 def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monkeypatch, tmp_path, capsys):
     real = batching.make_batch
 
@@ -109,7 +125,7 @@ def test_nan_stops_with_step_and_quantity_and_the_last_checkpoint_is_usable(monk
     code = cli.guard(lambda: trainer.train(PLAIN, tiny_dataset.dataset(), tmp_path, sparse), "spnr")
     line = capsys.readouterr().err.splitlines()[-1]
     assert code == 2
-    assert re.match(r"spnr: \w+ is nan at step 4; the last checkpoint is kept", line)
+    assert re.match(r"spnr: \w+ is nan at step 4; earlier checkpoints are kept", line)
     state = restored(tmp_path)
     assert int(state.step) == 2
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.generator))
@@ -162,6 +178,26 @@ def test_ctrl_c_is_exit_code_130_and_says_how_to_go_on(monkeypatch, tmp_path, ca
     expected = "spnr: stopped at step 1 of 6; the same command goes on from there"
     assert capsys.readouterr().err.splitlines()[-1] == expected
     assert int(restored(tmp_path).step) == 1
+
+
+TWICE = """
+import hashlib, os, signal, threading, time
+from spnr_jax.training.trainer import stop_requests
+
+def press():
+    for _ in range(2):
+        time.sleep(1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+with stop_requests():
+    threading.Thread(target=press, daemon=True).start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2 * 10**9)  # hears nothing, as a program that compiles
+"""
+
+
+def test_a_second_ctrl_c_ends_the_process_even_while_python_hears_nothing():
+    done = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr.split(";")[0]) == (130, "\nstopping after this step")
 
 
 def test_a_state_that_is_not_finite_is_named_though_every_loss_is(monkeypatch, tmp_path):

@@ -181,6 +181,15 @@ def test_check_notices_points_that_miss_the_object(finished):
     assert check.points_on_object(replace(item, images=np.zeros_like(item.images))) == 0
 
 
+def test_a_damaged_object_is_left_out_of_the_contact_sheet_and_named(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "data")
+    first, *others = sorted(layout.list_completed(folder))
+    (folder / "objects" / first / "points.ply").write_bytes(b"ply\n")
+    page = show.show(show.ShowConfig(dataset=folder)).read_text()
+    assert f"left out: {folder}" in capsys.readouterr().err
+    assert all(name in page for name in others)
+
+
 def test_the_contact_sheet_is_one_file_that_shows_every_picture(finished, tmp_path):
     page = show.show(show.ShowConfig(dataset=finished, to=tmp_path / "sheet.html")).read_text()
     assert page.count("data:image/png;base64,") == 4 * (2 * VIEWS + 3)

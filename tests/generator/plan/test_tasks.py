@@ -49,8 +49,9 @@ def test_a_test_list_is_the_test_split(tmp_path):
     split = planned(test_list=tmp_path / "test.txt", val_fraction=0.25).split(ids(made.tasks))
     assert split["test"] == ids(made.tasks)[3:7]
     assert len(split["val"]) == 9
-    (tmp_path / "test.txt").write_text("chair_000000 moon sun")
-    with pytest.raises(ValueError, match=r"^--test-list .*test\.txt: no object moon \(2 of 3 ids unknown\)$"):
+    (tmp_path / "test.txt").write_text("\ufeffchair_000000\n\nfull moon\n sun\n", encoding="utf-8")
+    reason = r"^--test-list .*test\.txt: no object 'full moon' \(2 of 3 ids unknown\); ids are .*chair_000000"
+    with pytest.raises(ValueError, match=reason):
         tasks.plan_data_set(config(objects=8, test_list=tmp_path / "test.txt"))
 
 
