@@ -47,7 +47,7 @@ def show(config: ShowConfig) -> Path:
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
     page = template(Path(__file__).with_name("contact_sheet.html")).render(
         title=f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects",
-        objects=list(shown_objects(config.dataset, [object_ids[index] for index in chosen])),
+        objects=list(describe_objects(config.dataset, [object_ids[index] for index in chosen])),
     )
     path = config.to or config.dataset / "contact_sheet.html"
     write_whole(path, page.encode())
@@ -55,7 +55,7 @@ def show(config: ShowConfig) -> Path:
     return path
 
 
-def shown_objects(dataset: Path, names: list[str]) -> Iterator[dict]:
+def describe_objects(dataset: Path, names: list[str]) -> Iterator[dict]:
     """The objects as the page shows them, without damaged ones, which are named on stderr."""
     for name in names:
         try:
