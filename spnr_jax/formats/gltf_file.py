@@ -67,7 +67,7 @@ class GltfFile:
         if "sparse" in accessor or "bufferView" not in accessor:
             raise UserError(f"accessor {index} is sparse or holds no data, which is not read: export it plain")
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        number, count, start = accessor["bufferView"], accessor["count"], accessor.get("byteOffset", 0)
+        number, count, start = accessor["bufferView"], int(accessor["count"]), accessor.get("byteOffset", 0)
         size, view = dtype.itemsize * width, self.view(number)
         stride = self.document["bufferViews"][number].get("byteStride") or size
         if stride < size:

@@ -47,8 +47,8 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     text = _parse(decode_text(path.read_bytes()))
     if text["l"]:
         loading.ignored.add("lines")
-    if text["surf"] and not text["f sizes"]:
-        raise UserError("holds curved surfaces (NURBS), which are not read: export it as a mesh")
+    if (text["surf"] or text["curv"]) and not text["f sizes"]:
+        raise UserError("holds curved surfaces or curves (NURBS), which are not read: export it as a mesh")
     columns = _columns(text, loading)
     if not text["f sizes"]:
         if len(text["vn"]) == len(text["v"]):
@@ -78,7 +78,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
 
 def _parse(content: str) -> Rests:
     """Lines by keyword, without it; faces as all corners (words like 1/2/3, from 1), sizes and materials."""
-    keywords = ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf", POLYPAINT)
+    keywords = ("v", "vt", "vn", "f", "f sizes", "l", "usemtl", "mtllib", "surf", "curv", POLYPAINT)
     found: Rests = {keyword: [] for keyword in keywords}
     counted, material = (found["v"], found["vt"], found["vn"]), ""
     content = content.replace("\r\n", "\n").replace("\r", "\n")

@@ -244,6 +244,8 @@ def test_colours_of_faces_count_if_all_vertices_have_the_same(tmp_path):
 def test_lines_and_other_elements_that_are_not_read_are_said(tmp_path):
     lines = read(write(tmp_path, "a.obj", TWO_SQUARES + "l 1 2 3\nl 5 6\n"))[1]
     assert "ignored: lines" in lines
+    with pytest.raises(ValueError, match="curves .NURBS., which are not read"):
+        read(write(tmp_path, "a.obj", TWO_SQUARES + "cstype bspline\ndeg 3\ncurv 0 1 1 2 3 4\nend\n"))
     more = "element material 1\nproperty uchar red\n"
     content = two_squares_ply(more, "", "", "", ["", ""]).replace("end_header\n", "end_header\n7\n")
     assert "ignored: PLY element material" in read(write(tmp_path, "a.ply", content), num_points=9)[1]

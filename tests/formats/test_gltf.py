@@ -298,7 +298,8 @@ def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
 
 def test_a_primitive_without_positions_and_a_header_padded_with_zeros_cost_no_mesh(tmp_path):
     path = square(change=lambda d: d["meshes"][0]["primitives"].append({"attributes": {}})).write(tmp_path / "a.gltf")
-    path.write_bytes(path.read_bytes() + b"\0\0")
+    assert b'"count": 4,' in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(b'"count": 4,', b'"count": 4.0,') + b"\0\0")
     asset = load_mesh(path)
     np.testing.assert_array_equal(asset.parts[0].positions, CORNERS)
     assert "primitives without positions" in asset.ignored

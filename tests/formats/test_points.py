@@ -129,7 +129,7 @@ REFUSED = [
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
     ("a.txt", "# 3D point list with one line\n", "COLMAP's points, which is not read: .* .colmap model_converter"),
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
-    ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curved surfaces .NURBS."),
+    ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curves .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
     ("a.xyz", "# nothing yet\n", "holds 0 points: expected rows of numbers, .*; found 'nothing yet'"),
     ("a.xyz", "version https://git-lfs.github.com/spec/v1\n", "a pointer .* Git LFS, .*git lfs pull"),
