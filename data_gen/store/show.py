@@ -47,7 +47,7 @@ def show(config: ShowConfig) -> Path:
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
     page = template(Path(__file__).with_name("contact_sheet.html")).render(
         title=f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects",
-        objects=list(describe_objects(config.dataset, [object_ids[index] for index in chosen])),
+        objects=describe_objects(config.dataset, [object_ids[index] for index in chosen]),
     )
     path = config.to or config.dataset / "contact_sheet.html"
     write_whole(path, page.encode())

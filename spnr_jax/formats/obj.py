@@ -166,15 +166,15 @@ def _parts(
     for code in np.unique(kind):
         material, move = list(looks.values())[code // 4]
         assert material is not None
-        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=colors)
-        placed = moved(move) if code & 2 else None
-        part = replace(part, normals=normals if code & 1 else None, texcoords=placed)
-        if colors is not None and material.base_color.ndim > 1 and placed is None:
-            part = replace(part, material=replace(material, base_color=np.ones(3, np.float32)))
-        elif colors is not None and material.base_color.ndim > 1:
-            loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
-            part = replace(part, colors=None)
-        parts.append(part)
+        own, placed = colors, moved(move) if code & 2 else None
+        if colors is not None and material.base_color.ndim > 1:
+            if placed is None:
+                material = replace(material, base_color=np.ones(3, np.float32))
+            else:
+                loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
+                own = None
+        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=own)
+        parts.append(replace(part, normals=normals if code & 1 else None, texcoords=placed))
     return parts
 
 

@@ -179,8 +179,10 @@ def colored_part(
 def _face_colors(of_faces: Columns, colors: np.ndarray | None) -> tuple[np.ndarray, list[str]] | None:
     """Colours (f, 3) of polygons, and lines about them, if those of the vertices (n, 3) are unknown, or one for all."""
     columns = rename(of_faces)
-    if colors is None or (colors != colors[:1]).any():
-        return colors_of(columns) if colors is None else None
+    if colors is None:
+        return colors_of(columns)
+    if (colors != colors[:1]).any():
+        return None
     with contextlib.suppress(UserError):  # those of the vertices can be read
         found = colors_of({name: columns[name] for name in SRGB if name in columns})
         return found if found is not None and (found[0] != found[0][:1]).any() else None

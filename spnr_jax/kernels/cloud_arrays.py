@@ -8,6 +8,7 @@ thinning    a random sample while reading, then voxels, then farthest-point samp
 """
 
 from collections.abc import Iterable
+from dataclasses import MISSING, fields
 from functools import reduce
 from operator import add
 from typing import Any
@@ -24,8 +25,7 @@ from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
 
 SMALLEST_BUCKET = 512
-ON_HOST = "runs on the host, so jit, vmap and grad cannot trace it; call it before them"
-NEEDED = ("positions", "base_color", "roughness", "metallic", "mask")  # fields of a cloud that are never None
+NEEDED = {x.name for x in fields(PointCloud) if x.default is MISSING}  # fields of a cloud that are never None
 VECTORS = ("positions", "base_color", "normals")  # fields of a cloud with three numbers a point
 
 
@@ -78,13 +78,12 @@ def check_finite(cloud: PointCloud, where: str) -> None:
 def refuse_tracers(arrays: Any, where: str) -> None:
     """ValueError, which names the function, for arrays that JAX traces: what runs on the host needs their values."""
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arrays)):
-        raise UserError(f"{where}: {ON_HOST}")
+        raise UserError(f"{where}: runs on the host, so jit, vmap and grad cannot trace it; call it before them")
 
 
 def refuse_jit(where: str) -> None:
     """ValueError, which names the function, inside `jit`: programs with options of their own cannot be called there."""
-    if isinstance(jax.numpy.add(0, 0), jax.core.Tracer):
-        raise UserError(f"{where}: {ON_HOST}")
+    refuse_tracers(jax.numpy.add(0, 0), where)
 
 
 def strip(cloud: PointCloud) -> PointCloud:

@@ -89,7 +89,6 @@ class Model:
         of its samples per ray.  At `trained` it samples the whole box, as in training.
         """
         check_camera_kind(camera)
-        cloud_arrays.refuse_jit("Model.render")
         cloud_arrays.refuse_tracers(camera, "Model.render")
         axes = np.shape(camera.cam_to_world)[:-2]
         if not axes:
