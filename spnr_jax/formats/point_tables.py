@@ -122,8 +122,7 @@ def _rows_of_numbers(head: Head, lines: Iterator[Line], counted: Counter[str]) -
         elif text.startswith(COMMENTS):
             counted["commented"] += _is_commented_row(text, len(head.fields))
         elif text and text not in names:
-            text = EMPTY[head.delimiter].sub("nan", text) if head.delimiter else text
-            yield number, text if head.delimiter == "," else text.replace(",", ".")
+            yield number, EMPTY[head.delimiter].sub("nan", text) if head.delimiter else text
 
 
 def _load_table(rows: list[Line], head: Head, words: Collection[int]) -> np.ndarray:
@@ -268,6 +267,7 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
+    texts = [text if delimiter == "," else text.replace(",", ".") for text in texts]  # decimal commas
     texts = [FORTRAN.sub(r"\1e", WHOLE.sub("", UNDEFINED.sub("nan", DASH.sub("nan", text)))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)

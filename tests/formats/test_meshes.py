@@ -250,7 +250,7 @@ BROKEN = [  # text, library, words of the refusal
     (VERTICES + "f 1 2 9\n", None, "name v 9 of 4: broken"),
     (VERTICES.replace("1 1 0", "1 1") + "f 1 2 3\n", None, "v 3: expected 3 numbers, found '1 1'"),
     (VERTICES + "f -5 2 3\n", None, "before the first"),
-    (VERTICES.replace("1 1 0", "1 0,5 0") + "f 1 2 3\n", None, "v 3: expected 3 numbers, found '1 0,5 0'"),
+    (VERTICES.replace("1 1 0", "1 0;5 0") + "f 1 2 3\n", None, "v 3: expected 3 numbers, found '1 0;5 0'"),
     (VERTICES + "f 1 1 3\n", None, "no face with an area"),
 ]
 

@@ -34,6 +34,7 @@ OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for
 PCL = "VERSION .7\nCOLUMNS x y z rgb\nsize 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
+COMMA_PLY = ply_bytes("ascii", rows=POINTS, properties=DOUBLES).replace(b".", b",").replace(b"1,0\n", b"1.0\n", 1)
 FLOATS = [(*row[:3], 40.0, 170.0, 60) for row in ROWS]
 THOUSANDS = [(*(f"{value:010,.4f}" for value in row[:3]), *GREEN) for row in ROWS]
 GERMAN = "X;Y;Höhe;Rot;Grün;Blau\n" + table(";", comma=True)
@@ -107,6 +108,10 @@ TEXTS = {
     "trailing commas, names as well": ("a.csv", "x,y,z,r,g,b,\n" + table(",", ",")),
     "trailing semicolons": ("a.txt", table(";", ";")),
     "decimal commas": ("a.csv", "x;y;z;r;g;b\n" + table(";", comma=True)),
+    "grey: decimal commas in an OBJ": ("a.obj", POINT_LINES.replace(".", ",")),
+    "grey: decimal commas in an OFF": ("a.off", "OFF\n420 0 0\n" + table(" ", comma=True, columns=POINTS)),
+    "grey: decimal commas in a PLY": ("a.ply", COMMA_PLY),
+    "names of a grid": ("a.csv", "Grid Northing,Grid Easting,Elevation,R,G,B\n" + table(",", columns=NORTHING)),
     "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
     "an array's columns by number, as pandas writes them": ("a.csv", "0,1,2,3,4,5\n" + table(",")),
     "counts of points and columns": ("a.xyz", "420 6\n" + table(" ")),
