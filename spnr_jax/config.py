@@ -154,11 +154,6 @@ class NetworkConfig:
         return False
 
     @property
-    def per_pixel(self) -> bool:
-        """Whether pixels are independent of their neighbours, so that it can be trained on a lattice of them."""
-        return False
-
-    @property
     def any_size(self) -> bool:
         """Whether it can render pictures of any size; an upsampler has learnt one size."""
         return not self.upsamples
@@ -210,11 +205,6 @@ class PaperConfig(NetworkConfig):
         """Whether the graph contains the upsampler."""
         return self.image_resolution != self.render_resolution
 
-    @property
-    def per_pixel(self) -> bool:
-        """The upsampler mixes pixels."""
-        return not self.upsamples
-
 
 @dataclass(frozen=True, kw_only=True)
 class SurfelConfig(NetworkConfig):
@@ -254,8 +244,6 @@ class LossConfig:
     """Steps between R1 penalties; each is scaled by this number (lazy regularisation)."""
     discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
-    masked: bool = False
-    """Exclude pixels of opacity 0 from the errors of the image: Point-NeRF's rays without a point in reach."""
     opacity_l1_weight: float = 0.0
     """L1 between the opacity and the reference's."""
     opacity_weight: float = 0.0
@@ -326,8 +314,6 @@ class TrainConfig:
     """Points per object in evaluation."""
     seed: int = 0
     """Seed of weights, batches and jitter."""
-    pixel_stride: int = 1
-    """Train on every n-th row and column of a view, at a random offset."""
     crop: int = 0
     """Surfels: pixels along each side of the random crops of G-buffers that the shader trains on.  Others: 0."""
     even_share: float = 0.0
@@ -336,7 +322,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         counts = "num_steps", "batch_objects", "views_per_object", "min_points", "max_points", "test_points"
-        check(self, positive=(*counts, "pixel_stride"), shares=("even_share",))
+        check(self, positive=counts, shares=("even_share",))
         require(
             self.loss.adversarial_weight == 0 or self.model.image_resolution >= 24,
             f"image_resolution {self.model.image_resolution} is too small for the discriminator; use at "
@@ -345,11 +331,6 @@ class TrainConfig:
         require(
             self.loss.adversarial_weight == 0 or self.model.has_discriminator,
             f"adversarial_weight {self.loss.adversarial_weight}: {self.model.method} has no discriminator; use 0",
-        )
-        require(
-            self.pixel_stride == 1 or (self.model.per_pixel and self.model.image_resolution % self.pixel_stride == 0),
-            f"pixel_stride {self.pixel_stride} needs a network whose pixels do not depend on their neighbours and an "
-            f"image_resolution that it divides ({self.model.image_resolution}); use 1",
         )
         if self.model.crops:
             require(

@@ -112,8 +112,8 @@ METHODS: dict[str, Method] = {
 
 # entries of files that are no fields of a config: those of earlier versions, and those that name a network's class
 EXTRA_FIELDS: dict[type, tuple[str, ...]] = {
-    TrainConfig: ("trains",),
-    LossConfig: ("pixel",),
+    TrainConfig: ("trains", "pixel_stride"),
+    LossConfig: ("pixel", "masked"),
     NetworkConfig: ("method", "source"),
 }
 

@@ -43,7 +43,6 @@ from spnr_jax.presets import PRESETS, surfels, tiny
         (TrainConfig, "num_steps", 0, "above 0"),
         (TrainConfig, "num_steps", -3, "a whole number, above 0"),
         (TrainConfig, "min_points", 5000, "max_points 4096"),
-        (TrainConfig, "pixel_stride", 2, "neighbours"),
         (TrainConfig, "even_share", 1.1, "a share"),
         (Schedule, "log_every", 0, "above 0"),
     ],

@@ -8,12 +8,14 @@ for method in (
     Method(
         config=point_nerf.PointNeRFConfig,
         network=point_nerf.PointNeRF,
+        loss=point_nerf.loss,
         presets=(point_nerf.point_nerf_tiny,),
         label="Point-NeRF",
     ),
     Method(
         config=points2nerf.Points2NeRFConfig,
         network=points2nerf.Points2NeRF,
+        loss=points2nerf.loss,
         presets=(points2nerf.points2nerf_tiny,),
         label="Points2NeRF",
     ),

@@ -5,7 +5,7 @@
 Point-NeRF (Xu et al., 2022) learns a feature for every point of one scene; here a point carries its materials, so that
 one network serves all objects, and nothing is grown, pruned or weighted by confidence.  Reach is a ball of `radius` in
 units of the box [-1, 1]^3, in which an object's half-diagonal is 1: 0.1 is a twentieth of its diagonal.  Nearest points
-are exact.  A ray without a point in reach is exactly white and has opacity 0; the colour loss leaves it out (`masked`).
+are exact.  A ray without a point in reach is exactly white and has opacity 0; `loss` leaves it out.
 
 Most of space is empty, so the work is done in blocks of shading points that exist, and blocks beyond the last of them
 are skipped: time follows what there is, memory is that of a block.  The geometry has no gradient.
@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -34,11 +34,13 @@ from spnr_jax.config import (
 )
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.errors import require
-from spnr_jax.kernels import cameras, compositing, sampling
+from spnr_jax.kernels import cameras, compositing, losses, sampling
 from spnr_jax.kernels.imaging import WHITE
+from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.numerics import length, per_feature
-from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering, record
+from spnr_jax.kernels.records import Batch, Camera, Key, PointCloud, Rays, Rendering, record
 from spnr_jax.kernels.voxels import map_existing
+from spnr_jax.methods import Outcome
 from spnr_jax.nn.paper_layers import encode_direction, waves
 
 BLOCK = 1024  # shading points at once: 8 MB for a layer of 256 with 8 neighbours
@@ -79,35 +81,32 @@ class PointNeRFConfig(NetworkConfig):
     """Density of one unit of the network's output, per unit of the box; 1 as published, where it learns slowly."""
     ray_chunk: int = 256
     """Rays of an object rendered at once in evaluation."""
+    pixel_stride: int = 1
+    """Trained on every n-th row and column of a view, at a random offset."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        counts = "num_neighbors", "num_candidates", "num_samples", "width", "color_width", "ray_chunk"
+        counts = "num_neighbors", "num_candidates", "num_samples", "width", "color_width", "ray_chunk", "pixel_stride"
         check(self, positive=(*counts, "radius", "density_scale"), shares=("jitter",))
         require(
             self.num_samples <= self.num_candidates,
             f"num_samples {self.num_samples} must not exceed num_candidates {self.num_candidates}",
         )
-
-    @property
-    def per_pixel(self) -> bool:
-        """Every ray is rendered by itself."""
-        return True
+        ray_chunks.check_stride(self)
 
 
-MASKED = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0, masked=True)
+SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
 
 
 def published_config(size: int) -> TrainConfig:
     """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU."""
     return TrainConfig(
         preset=f"point_nerf, {size} px, as published",
-        model=PointNeRFConfig(image_resolution=size),
-        loss=MASKED,
+        model=PointNeRFConfig(image_resolution=size, pixel_stride={128: 4, 200: 5}[size]),
+        loss=SQUARES,
         optimizer=OptimizerConfig(lr_generator=5e-4, warmup_steps=0, decay="exponential"),
         num_steps=1_000_000,
         batch_objects=1,
-        pixel_stride={128: 4, 200: 5}[size],
     )
 
 
@@ -126,13 +125,13 @@ def point_nerf_tiny() -> TrainConfig:
             density_scale=20.0,  # at the published 1 the objects are still fog after 1200 steps
             image_resolution=64,
             ray_chunk=1024,
+            pixel_stride=4,
         ),
-        loss=MASKED,
+        loss=SQUARES,
         optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
         num_steps=1200,
         batch_objects=4,
         max_points=1024,
-        pixel_stride=4,
     )
 
 
@@ -316,6 +315,19 @@ class PointNeRF(nn.Module):
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
         """Views of each cloud from its cameras, all rays at once.  A key moves the candidates (training)."""
         return ray_chunks.as_images(camera, *self.render_rays(self.encode(cloud, train), self.rays(camera), key))
+
+
+def loss(
+    variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
+) -> tuple[Float[Array, ""], Outcome]:
+    """(mean squared error of the rays with a point in reach, outcome)."""
+    assert isinstance(config.model, PointNeRFConfig)
+    key, batch = ray_chunks.choose_pixels(key, batch, config.model.pixel_stride)
+    rendering: Any = PointNeRF(config.model).apply(variables, batch.cloud, batch.camera, key, train=True)
+    hit, reference = rendering.acc > 0, jnp.asarray(batch.image)
+    squared = jnp.sum(jnp.where(hit[..., None], (rendering.image - reference) ** 2, 0))
+    metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
+    return squared / jnp.maximum(3 * jnp.sum(hit), 1), Outcome(metrics)
 
 
 def render_object(

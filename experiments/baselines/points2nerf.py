@@ -30,7 +30,9 @@ from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.numerics import per_feature
-from spnr_jax.kernels.records import Camera, Key, PointCloud, Rays, Rendering
+from spnr_jax.kernels.records import Batch, Camera, Key, PointCloud, Rays, Rendering
+from spnr_jax.method import inference
+from spnr_jax.methods import Outcome
 from spnr_jax.nn.paper_layers import encode_direction
 
 QUIET = -6.0  # log variance that the encoder begins with: codes are told apart from the first step on
@@ -68,21 +70,19 @@ class Points2NeRFConfig(NetworkConfig):
     """Stratified samples along each ray."""
     ray_chunk: int = 1024
     """Rays of an object rendered at once in evaluation."""
+    pixel_stride: int = 1
+    """Trained on every n-th row and column of a view, at a random offset."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         counts = "hidden_width", "code_size", "chunk_size", "chunk_embedding", "nerf_width", "num_samples", "ray_chunk"
-        check(self, positive=(*counts, "point_widths", "hypernetwork_widths"))
+        check(self, positive=(*counts, "pixel_stride", "point_widths", "hypernetwork_widths"))
         require(len(set(self.materials)) == len(self.materials), f"materials must be distinct, got {self.materials}")
         require(
             self.nerf_depth >= 2 and self.nerf_depth % 2 == 0,
             f"nerf_depth must be even and at least 2, got {self.nerf_depth}",
         )
-
-    @property
-    def per_pixel(self) -> bool:
-        """Every ray is rendered by itself."""
-        return True
+        ray_chunks.check_stride(self)
 
 
 SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
@@ -95,14 +95,13 @@ def published_config(size: int) -> TrainConfig:
     """
     return TrainConfig(
         preset=f"points2nerf, {size} px, as published",
-        model=Points2NeRFConfig(image_resolution=size),
+        model=Points2NeRFConfig(image_resolution=size, pixel_stride={128: 4, 200: 5}[size]),
         loss=SQUARES,
         optimizer=OptimizerConfig(
             lr_generator=5e-5, warmup_steps=0, algorithm="radam", decay="exponential", final_lr_scale=0.135
         ),
         num_steps=2_254_000,  # 2000 epochs of 1127 cars, the learning rate times 0.999 after each
         batch_objects=1,
-        pixel_stride={128: 4, 200: 5}[size],
     )
 
 
@@ -129,13 +128,13 @@ def points2nerf_tiny() -> TrainConfig:
             nerf_depth=4,
             num_samples=24,
             image_resolution=64,
+            pixel_stride=4,
         ),
         loss=SQUARES,
         optimizer=OptimizerConfig(lr_generator=3e-3, warmup_steps=30, ema_decay=0.995, algorithm="radam"),
         num_steps=1200,
         batch_objects=4,
         max_points=1024,
-        pixel_stride=4,
     )
 
 
@@ -302,3 +301,12 @@ class Points2NeRF(nn.Module):
             code_key, key = jax.random.split(key)
             code = code + jnp.exp(0.5 * log_variance) * jax.random.normal(code_key, code.shape)
         return ray_chunks.as_images(camera, *self.render_rays(self.weights(code), cameras.view_rays(camera), key))
+
+
+def loss(
+    variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
+) -> tuple[Float[Array, ""], Outcome]:
+    """`inference.loss` of some of the pixels."""
+    assert isinstance(config.model, Points2NeRFConfig)
+    key, batch = ray_chunks.choose_pixels(key, batch, config.model.pixel_stride)
+    return inference.loss(variables, batch, key, config=config)

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
 from spnr_jax.devices.runtime import QUICK
@@ -64,9 +64,6 @@ def loss(
     variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
     """(loss, outcome): errors of the rendered pixels, plus the losses that the network sows."""
-    if key is not None and config.pixel_stride > 1:
-        key, lattice_key = jax.random.split(key)
-        batch = lattice(lattice_key, batch, config.pixel_stride)
     rendering, updated = network(config.model).apply(
         variables, batch.cloud, batch.camera, key, train=True, mutable=["batch_stats", "losses"]
     )
@@ -74,39 +71,10 @@ def loss(
     if config.loss.opacity_weight or config.loss.opacity_l1_weight:
         opacity = losses.area_downsample(jnp.asarray(batch.alpha)[..., None], rendering.acc.shape[-1])[..., 0]
         terms["opacity"] = opacity_loss(config, rendering.acc, opacity)
-    mask = rendering.acc > 0 if config.loss.masked else None
     reference = jnp.asarray(batch.image)
-    value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference, mask)
+    value = reconstruction_loss(config, rendering.image, rendering.image_lr, reference)
     metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
     return sum(terms.values(), value), Outcome(metrics | terms, updated.get("batch_stats", {}), rendering.image, batch)
-
-
-def lattice(key: Key, batch: Batch, stride: int) -> Batch:
-    """The batch with every `stride`-th row and column of its views, from a random offset: still an image."""
-    first = jax.random.randint(key, (2,), 0, stride)
-
-    def thin(x):
-        for axis, start in zip((2, 3), first, strict=True):
-            x = x.reshape(*x.shape[:axis], x.shape[axis] // stride, stride, *x.shape[axis + 1 :])
-            x = jax.lax.dynamic_index_in_dim(x, start, axis + 1, keepdims=False)
-        return x
-
-    # the centre of the lattice's pixel i is at first + stride * i + 0.5 of the view
-    shift = 0.5 - (first[::-1] + 0.5) / stride
-    zoom = jnp.diag(jnp.array([1 / stride, 1 / stride, 1.0])).at[:2, 2].set(shift)
-    intrinsics = jnp.einsum("ij,...jk->...ik", zoom, batch.camera.intrinsics, precision="highest")
-    images = (batch.image, batch.alpha, batch.condition, batch.condition_mask)
-    image, alpha, condition, mask = (thin(jnp.asarray(x)) for x in images)
-    pose, (height, width) = batch.camera.cam_to_world, image.shape[2:4]
-    camera = Camera(cam_to_world=pose, intrinsics=intrinsics, height=height, width=width)
-    return Batch(cloud=batch.cloud, camera=camera, image=image, alpha=alpha, condition=condition, condition_mask=mask)
-
-
-def mean_error(error: Float[Array, "*batch 3"], mask: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
-    """Mean over all pixels, or over those where `mask` is True (0 if there are none)."""
-    if mask is None:
-        return jnp.mean(error)
-    return jnp.sum(jnp.where(mask[..., None], error, 0)) / jnp.maximum(3 * jnp.sum(mask), 1)
 
 
 def opacity_loss(
@@ -122,17 +90,16 @@ def reconstruction_loss(
     image: Float[Array, "*batch"],
     image_lr: Float[Array, "*batch_lr"] | None,
     reference: Array,
-    mask: Array | None = None,
 ) -> Float[Array, ""]:
     """Weighted errors of the image, and L1 of the low-resolution rendering against the downsampled reference."""
-    error = mean_error(jnp.abs(image - reference), mask)
+    error = losses.l1(image, reference)
     if config.model.upsamples:
         assert image_lr is not None, "a network that upsamples returns image_lr"
         low = losses.area_downsample(reference, image_lr.shape[-2])
         error = error + config.loss.low_resolution_weight * losses.l1(image_lr, low)
     error = config.loss.l1_weight * error
     if config.loss.mse_weight:
-        error = error + config.loss.mse_weight * mean_error((image - reference) ** 2, mask)
+        error = error + config.loss.mse_weight * losses.mse(image, reference)
     return error
 
 
