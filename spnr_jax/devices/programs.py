@@ -121,7 +121,7 @@ class CachedProgram:
     def _program(self, tree: Any, leaves: list, static: dict[str, Any], key: Any) -> Callable[..., Any]:
         """A function of the leaves; from a trace if programs are cached on disk."""
         folder = jax.config.values["jax_compilation_cache_dir"]
-        if folder is None:
+        if not folder:
             return lambda *leaves: self.jitted(*jax.tree.unflatten(tree, leaves), **static)
         trace = self._load(Path(folder), tree, leaves, static, key)
         return jax.jit(trace.call, compiler_options=self.options)

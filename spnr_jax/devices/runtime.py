@@ -98,7 +98,7 @@ CHECK_MARK = "looked-at"  # file whose modification time tells which entries wer
 
 
 def cache_programs() -> None:
-    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache."""
+    """Lets a second run skip XLA's compilation; JAX_COMPILATION_CACHE_DIR moves the cache, or disables it if empty."""
     hide_false_alarms()
     import jax
 
@@ -106,8 +106,9 @@ def cache_programs() -> None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(caches / "spnr_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-    with suppress(OSError):  # there is none yet, or it is not ours to mend
-        remove_broken(Path(jax.config.values["jax_compilation_cache_dir"]))
+    if cache := jax.config.values["jax_compilation_cache_dir"]:
+        with suppress(OSError):  # there is none yet, or it is not ours to mend
+            remove_broken(Path(cache))
 
 
 def hide_false_alarms() -> None:

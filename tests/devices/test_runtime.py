@@ -97,3 +97,19 @@ def test_a_cut_off_entry_is_made_anew_once_and_without_a_word(tmp_path):
     alone = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # JAX set it here
     done = subprocess.run(command, env=alone, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+UNCACHED = """
+import numpy as np
+from spnr_jax.devices.programs import CachedProgram
+from spnr_jax.devices.runtime import cache_programs
+cache_programs()
+assert CachedProgram(lambda x: 2 * x)(np.ones(3))[0] == 2
+"""
+
+
+def test_an_empty_folder_of_the_cache_means_none_and_the_current_folder_is_left_alone(tmp_path):
+    (tmp_path / "my-cache").write_text("mine")
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": ""}
+    subprocess.run([sys.executable, "-c", UNCACHED], cwd=tmp_path, env=environment, check=True, timeout=120)
+    assert [place.name for place in tmp_path.iterdir()] == ["my-cache"]
