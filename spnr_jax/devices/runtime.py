@@ -7,6 +7,7 @@ imports JAX before it is called: `cache_programs` comes before that.
 import ctypes
 import os
 import platform
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -94,6 +95,7 @@ SHORTEST = 0.1  # seconds of compilation from which a program is cached
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 QUICKEST = QUICK | {"xla_backend_optimization_level": 1}
 
+ENTRY = re.compile("-[0-9a-f]{64}-cache$")  # file names of JAX's entries
 CHECK_MARK = "looked-at"  # file whose modification time tells which entries were checked: all older ones
 
 
@@ -130,7 +132,7 @@ def remove_broken(cache: Path) -> None:
     begin, mark = time.time_ns(), cache / CHECK_MARK
     last = mark.stat().st_mtime_ns if mark.exists() else 0
     for entry in os.scandir(cache):
-        if entry.name.endswith("-cache") and entry.stat().st_mtime_ns >= last:
+        if ENTRY.search(entry.name) and entry.stat().st_mtime_ns >= last:
             try:
                 decompress_executable(Path(entry.path).read_bytes())
             except OSError:  # another process removed it, or it is another user's
