@@ -60,7 +60,7 @@ REFUSED = [  # command, what its line says
     (f"{TRAIN} --volume-resolution 9", "volume_resolution 9 cannot be halved 1 times; use a multiple of 2"),
     ("train missing new", "run `spnr-data generate missing`"),
     ("evaluate missing RUN", "spnr-data generate"),
-    ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate"),
+    ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate the data set anew"),
     ("evaluate DATA .", "not a run folder (config.json is missing); train one with `spnr train DATA"),
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
     ("render noise.npz --run RUN", "noise.npz"),
@@ -96,16 +96,11 @@ REFUSED = [  # command, what its line says
     ("export ball.xyz", "a file; expected a run folder, or of a cloud `spnr export ball.xyz --splats"),
     ("render ball.xyz --sun 40", "see spnr render --help"),
     ("render ball.xyz --resolution 63.5", "--resolution: expected INT, got '63.5'."),
-    ("render ball.xyz --num-points 1.5", "--num-points: expected INT, got '1.5'."),
     (
         "evaluate UNTESTED ball.xyz",
         "ball.xyz: a file; expected a run folder, a file of weights (.npz) or the name surfels",
     ),
     ("evaluate UNTESTED RUN --split train --out ball.xyz", "ball.xyz is a file, not a folder; choose another place"),
-    (
-        "evaluate UNTESTED RUN --split val",
-        "the val split is empty; score --split train, or generate the data set anew",
-    ),
     ("export RUN --light studio", "--light is for --splats"),
     ("export RUN --sun 40 30", "--sun is for --splats"),
     ("export RUN --fitting-views 8", "--fitting-views is for --splats"),
@@ -272,14 +267,6 @@ def test_train_evaluate_and_render_write_a_run_its_scores_and_a_picture(capsys, 
     assert set(metrics["seconds"]) == {"evaluate", "total"}
     assert metrics["methods"]["paper"]["objects"] == len(tiny_dataset.SPLITS["test"])
     assert (tmp_path / "scores" / "report.html").is_file()
-
-
-def test_an_error_of_the_program_keeps_its_traceback():
-    def broken():
-        raise AssertionError("a bug")
-
-    with pytest.raises(AssertionError, match="a bug"):
-        cli.guard(broken, "spnr")
 
 
 def test_an_error_shows_its_call_stack_for_debug_alone_and_its_line_in_any_case(capsys, monkeypatch):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 from jaxtyping import TypeCheckError
 
-from spnr_jax.kernels import compositing, sampling
+from spnr_jax.kernels import compositing
 from spnr_jax.nn.convolution import GroupNorm
 
 
@@ -14,11 +14,6 @@ def test_two_arguments_that_must_share_an_axis_may_not_differ():
     compositing.volume_weights(jnp.ones((3, 4)), jnp.ones((3, 4)))
     with pytest.raises(TypeCheckError, match="delta"):
         compositing.volume_weights(jnp.ones((3, 4)), jnp.ones((3, 5)))
-
-
-def test_a_kernel_that_wants_one_more_edge_than_bins_says_so():
-    with pytest.raises(TypeCheckError, match="weights"):
-        sampling.importance(None, jnp.linspace(0.0, 1.0, 5), jnp.ones(5), 8)
 
 
 def test_the_fields_and_calls_of_linen_modules_are_checked():

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.laws import close, numbers, same_bits
+from support.laws import close, numbers
 
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cameras import (
@@ -15,7 +15,6 @@ from spnr_jax.kernels.cameras import (
     pinhole,
     project,
     resize,
-    view_rays,
 )
 
 EYES = 3 * numbers(0, 2, 3, 3) + 0.1
@@ -94,16 +93,6 @@ class TestBox:
             assert not hit
             assert near == far == 0
 
-    @pytest.mark.parametrize("slope", [0.0, 1e-30, 1e-20, 1e-19, 1e-12, 1e-11, 1e-7])
-    def test_rays_that_are_nearly_parallel_to_a_face_have_a_finite_gradient(self, slope):
-        origins = jnp.array([[0.1, 0.2, 3.0], [1e8, 0.2, 3.0]])
-        directions = jnp.broadcast_to(jnp.array([slope, 0.0, -1.0]), (2, 3))
-        near, far, hit = intersect_box(origins, directions)
-        close((near, far, hit), (np.array([2.0, 0.0]), np.array([4.0, 0.0]), np.array([True, False])))
-        gradients = jax.grad(lambda o, d: sum(map(jnp.sum, intersect_box(o, d)[:2])), (0, 1))(origins, directions)
-        close(gradients[0], jnp.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
-        assert jnp.isfinite(gradients[1]).all()
-
 
 class TestOrbit:
     @pytest.mark.parametrize("elevation", [-np.pi / 2, -0.4, 0.0, 1.2, np.pi / 2])
@@ -119,10 +108,3 @@ class TestOrbit:
         for azimuth, pole in itertools.product((0.0, 1.0, 4.0), (-np.pi / 2, np.pi / 2, 1.5 * np.pi)):
             poses = [np.asarray(orbit(azimuth, pole + step, 3.0, jnp.zeros(3))) for step in (-2e-3, 0, 2e-3)]
             close(np.diff(poses, axis=0), np.zeros((2, 3, 4)), atol=1e-2)
-
-
-def test_views_become_one_axis_of_rays():
-    rays, flat = camera_rays(camera()), view_rays(camera())
-    assert flat.origins.shape == (2, 72, 3)
-    same_bits(flat.directions.reshape(rays.directions.shape), rays.directions)
-    same_bits(flat.origins.reshape(rays.origins.shape), rays.origins)

@@ -5,19 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from support import reference
 from support.laws import close, numbers, same_bits
 
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.voxels import mean_contributions, row_of, scatter_conv, scatter_mean, trilinear
+from spnr_jax.kernels.voxels import mean_contributions, row_of, scatter_conv, scatter_mean
 
 D = 4
 POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel
 FEATURES = numbers(1, 2, 3, 12, 2)
 MASK = np.random.default_rng(2).uniform(size=(2, 3, 12)) > 0.3
-VOLUME = numbers(3, D, D, D, 2)
 scatter = jax.jit(scatter_mean, static_argnums=3)
-lookup, locate = jax.jit(trilinear), jax.jit(voxels.locate, static_argnums=1)
+locate = jax.jit(voxels.locate, static_argnums=1)
 
 
 class TestLocate:
@@ -36,16 +34,6 @@ class TestLocate:
 
 class TestScatterMean:
     cloud = POSITIONS[0, 0], FEATURES[0, 0], jnp.asarray(MASK[0, 0])
-
-    def test_the_order_of_points_in_voxels_of_their_own_does_not_matter_by_a_bit(self):
-        cells = np.random.default_rng(9).permutation(D**3)[:12]
-        positions = np.stack(np.unravel_index(cells, (D, D, D)), axis=-1).astype(np.float32) * (2 / D) - 1 + 0.1
-        order = np.random.default_rng(4).permutation(12)
-        features, mask = np.asarray(FEATURES[0, 0]), MASK[0, 0]
-        one, other = (
-            scatter(*map(jnp.asarray, (positions[o], features[o], mask[o])), D) for o in (np.arange(12), order)
-        )
-        same_bits(one, other)
 
     @pytest.mark.parametrize(
         ("point", "kept"),
@@ -115,19 +103,3 @@ class TestScatterConv:
 
         sparse, dense = both(self.sparse), both(self.dense)
         close(sparse, dense, rtol=1e-4, atol=1e-5)
-        volume = self.volume(POSITIONS[0, 0], FEATURES[0, 0], mask)
-        close(sparse[0][1], reference.convolution(volume, self.kernel), atol=1e-5)
-
-
-class TestTrilinear:
-    def test_is_continuous_across_cells_and_constant_within_half_a_voxel_of_the_border(self):
-        along = jnp.stack([jnp.linspace(-1, 1, 2001), jnp.full(2001, 0.1), jnp.full(2001, -0.3)], axis=-1)
-        values = np.asarray(lookup(VOLUME, along))
-        assert np.abs(np.diff(values, axis=0)).max() < 0.001 * 2 * D
-        assert (values[:250] == values[0]).all()
-
-    def test_outside_the_box_there_is_nothing_in_value_and_gradient(self):
-        outside = jnp.array([[1.001, 0.0, 0.0], [0.0, -1.5, 0.0], [0.0, 0.0, 1e10], [-1e10, 0.0, 0.0]])
-        assert (lookup(VOLUME, outside) == 0).all()
-        gradients = jax.jit(jax.grad(lambda v, p: jnp.sum(trilinear(v, p)), (0, 1)))(VOLUME, outside)
-        assert all((g == 0).all() for g in gradients)

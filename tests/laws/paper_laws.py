@@ -275,8 +275,8 @@ def scene(rng, density=3.0, distance=3.0):
 NETWORK = (
     Law("BatchNorm", batch_norm, batch_norm_twin, spreads((256, 8), np.ones(256)),
         extremes=Extremes((extremes(POINTS, 3, high=17), masks), rtol=1e-5, atol=rounding_of_means), smooth=False),
-    Law("GroupNorm", lambda x: GroupNorm(1).apply(initial(GroupNorm(1), x[None]), x[None])[0],
-        lambda x: reference.group_norm(x, 1, 1.0, 0.0), spreads((4, 4, 4, 4))),
+    Law("GroupNorm", lambda x: GroupNorm(2).apply(initial(GroupNorm(2), x[None]), x[None])[0],
+        lambda x: reference.group_norm(x, 2), spreads((4, 4, 4, 4))),
     Law("whole render", render, None, (Axis("density", 1e-30, 1, 1e30, scene),
             Axis("distance of the camera", 1, 3, 10, lambda rng, v: scene(rng, distance=v))), floors=(1.0, 1.0, 1.0),
         smooth=False),

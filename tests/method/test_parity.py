@@ -20,9 +20,9 @@ TOLERANCE = 1e-4
 ARRAYS = twin.load()
 CONFIG = twin.config(ARRAYS)
 BATCH = jax.tree.map(jnp.asarray, make_batch(twin.inputs(ARRAYS)))
-GENERATOR, STATISTICS = twin.generator(ARRAYS)
-DISCRIMINATOR = twin.discriminator(ARRAYS)
-VARIABLES = {"params": GENERATOR, "batch_stats": STATISTICS}
+GENERATOR, DISCRIMINATOR = (twin.named(ARRAYS, f"param/{network}.") for network in ("gen", "disc"))
+PARAMS, STATISTICS = twin.generator(GENERATOR)
+VARIABLES = {"params": PARAMS, "batch_stats": STATISTICS}
 
 
 def agree(ours, theirs, tolerance=TOLERANCE):
@@ -89,35 +89,20 @@ def stages():
     return run(VARIABLES, BATCH.cloud, BATCH.camera)
 
 
-STAGES = (
-    *("voxel_offset", "point_features", "grid", "volume", "ray_direction", "near", "far", "direction_encoding"),
-    *("coarse_t", "coarse_lookup_row0", "coarse_density", "coarse_rgb_row0", "coarse_weights", "fine_t"),
-    *("features", "rgb", "acc", "depth", "image"),
-)
-
-
-@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize("name", sorted(set(twin.named(ARRAYS, "eval/")) - {"logits_fake", "logits_real"}))
 def test_every_stage_of_the_generator_is_the_twins(stages, name):
     agree(stages[name], ARRAYS[f"eval/{name}"].reshape(stages[name].shape))
 
 
-def test_points_lie_in_the_same_voxels(stages):
-    np.testing.assert_array_equal(stages["voxel_index"], ARRAYS["eval/voxel_index"])
+def judge(image):
+    """Logits of the discriminator."""
+    params = {"params": twin.discriminator(DISCRIMINATOR)}
+    return optimisation.discriminator_of(CONFIG).apply(params, image, BATCH.condition[0], BATCH.condition_mask[0])
 
 
 @pytest.mark.parametrize(("name", "source"), [("fake", "eval/image"), ("real", "in/target")])
 def test_logits(name, source):
-    logits = optimisation.discriminator_of(CONFIG).apply(
-        {"params": DISCRIMINATOR}, jnp.asarray(pictures(source)), BATCH.condition[0], BATCH.condition_mask[0]
-    )
-    agree(logits, pictures(f"eval/logits_{name}"))
-
-
-def judge(params, image):
-    logits = optimisation.discriminator_of(CONFIG).apply(
-        {"params": params}, image[:, 0], BATCH.condition[0], BATCH.condition_mask[0]
-    )
-    return losses.generator_adversarial(logits)
+    agree(judge(jnp.asarray(pictures(source))), pictures(f"eval/logits_{name}"))
 
 
 @pytest.fixture(scope="module")
@@ -125,18 +110,18 @@ def trained():
     """Rendering, losses, statistics and gradients of the generator in training, without jitter."""
 
     @jax.jit
-    def run(params):
-        def loss(params):
-            variables = {"params": params, "batch_stats": STATISTICS}
+    def run(named):
+        def loss(named):
+            variables = {"params": twin.generator(named)[0], "batch_stats": STATISTICS}
             rendering, updated = inference.network(CONFIG.model).apply(
                 variables, BATCH.cloud, BATCH.camera, train=True, mutable=["batch_stats"]
             )
             l1 = inference.reconstruction_loss(CONFIG, rendering.image, rendering.image_lr, BATCH.image)
-            adversarial = CONFIG.loss.adversarial_weight * judge(DISCRIMINATOR, rendering.image)
+            adversarial = CONFIG.loss.adversarial_weight * losses.generator_adversarial(judge(rendering.image[:, 0]))
             parts = {"l1": l1, "adv": adversarial, "loss_g": l1 + adversarial}
             return l1 + adversarial, (rendering, updated["batch_stats"], parts)
 
-        return jax.value_and_grad(loss, has_aux=True)(params)
+        return jax.value_and_grad(loss, has_aux=True)(named)
 
     (_, (rendering, statistics, parts)), gradients = run(GENERATOR)
     return rendering, statistics, parts, gradients
@@ -160,56 +145,12 @@ def test_images_losses_and_statistics_of_the_training(trained):
 
 def test_gradients_of_every_parameter(trained):
     """The norms of all, and those that are stored in full."""
-    norms, stored = (
-        {name.removeprefix(begin): x for name, x in ARRAYS.items() if name.startswith(begin)}
-        for begin in ("train/grad_norm/gen.", "train/grad/gen.")
-    )
-    ours = twin_named(trained[3])
-    assert set(ours) == set(norms)
+    norms = twin.named(ARRAYS, "train/grad_norm/gen.")
+    assert set(trained[3]) - set(norms) == {name for name in GENERATOR if "running" in name}
     for name, norm in norms.items():
-        agree(np.linalg.norm(ours[name]), norm)
-    for name, gradient in stored.items():
-        agree(ours[name], gradient)
-
-
-def twin_named(tree):
-    """Gradients under the twin's names and in its layout."""
-
-    def conv(x):
-        return np.moveaxis(np.asarray(x), (-1, -2), (0, 1))
-
-    points, unet, upsampler = tree["encoder"]["pointnet"], tree["encoder"]["unet"], tree["upsampler"]
-    named = {"points.out.weight": points["out"]["kernel"].T, "points.out.bias": points["out"]["bias"]}
-    for i in range(3):
-        named[f"points.linears.{i}.weight"] = points[f"hidden_{i}"]["kernel"].T
-        named |= {
-            f"points.norms.{i}.weight": points[f"norm_{i}"]["scale"],
-            f"points.norms.{i}.bias": points[f"norm_{i}"]["bias"],
-        }
-    for name, block in unet.items():
-        prefix = "unet." + name.replace("_", ".")
-        named |= {f"{prefix}.conv.weight": conv(block["kernel"])}
-        named |= {f"{prefix}.norm.weight": block["norm"]["scale"], f"{prefix}.norm.bias": block["norm"]["bias"]}
-    for i in range(4):
-        named |= {
-            f"upsampler.conv{i}.weight": conv(upsampler[f"kernel_{i}"]),
-            f"upsampler.conv{i}.bias": upsampler[f"bias_{i}"],
-        }
-    return named | twin_named_field(tree["field"])
-
-
-def twin_named_field(field):
-    """Ours keeps density and RGB in one matrix, and the rows of hidden layer and direction in two."""
-    head, bias = field["head"]["kernel"], field["head"]["bias"]
-    hidden = np.concatenate([head[:, 1:], field["features"]["kernel"]], axis=1)
-    return {
-        "renderer.field.hidden.weight": field["hidden"]["kernel"].T,
-        "renderer.field.hidden.bias": field["hidden"]["bias"],
-        "renderer.field.density.weight": head[:, :1].T,
-        "renderer.field.density.bias": bias[:1],
-        "renderer.field.feature.weight": np.concatenate([hidden, field["direction"]["kernel"]]).T,
-        "renderer.field.feature.bias": np.concatenate([bias[1:], field["feature_bias"]]),
-    }
+        agree(np.linalg.norm(trained[3][name]), norm)
+    for name, gradient in twin.named(ARRAYS, "train/grad/gen.").items():
+        agree(trained[3][name], gradient)
 
 
 @pytest.fixture(scope="module")
@@ -219,11 +160,12 @@ def discriminated():
     real, condition, mask = BATCH.image[0], BATCH.condition[0], BATCH.condition_mask[0]
     module = optimisation.discriminator_of(CONFIG)
 
-    def loss(params):  # step 1, where no R1 is due
-        return optimisation.discriminator_loss(CONFIG, params, fake, BATCH, jnp.int32(1))[0]
+    def loss(named):  # step 1, where no R1 is due
+        return optimisation.discriminator_loss(CONFIG, twin.discriminator(named), fake, BATCH, jnp.int32(1))[0]
 
-    def penalty(params):
-        r1 = losses.r1(lambda image: module.apply({"params": params}, image, condition, mask), real)
+    def penalty(named):
+        params = {"params": twin.discriminator(named)}
+        r1 = losses.r1(lambda image: module.apply(params, image, condition, mask), real)
         return CONFIG.loss.r1_gamma * r1
 
     return {name: jax.jit(jax.value_and_grad(f))(DISCRIMINATOR) for name, f in (("loss_d", loss), ("r1", penalty))}
@@ -232,14 +174,7 @@ def discriminated():
 @pytest.mark.parametrize(("name", "key"), [("loss_d", "grad_norm"), ("r1", "grad_norm_r1")])
 def test_losses_and_gradient_norms_of_the_discriminator(discriminated, name, key):
     agree(discriminated[name][0], ARRAYS[f"train/{name}"])
-    stored = {k.split("disc.")[1]: v for k, v in ARRAYS.items() if k.startswith(f"train/{key}/disc.")}
+    stored = twin.named(ARRAYS, f"train/{key}/disc.")
     assert len(stored) == 13
     for parameter, norm in stored.items():
-        agree(np.linalg.norm(parameter_of(discriminated[name][1], parameter)), norm)
-
-
-def parameter_of(tree, name):
-    kind, i, what = name.split(".")
-    if kind == "convs":
-        return tree[f"{'kernel' if what == 'weight' else 'bias'}_{i}"]
-    return tree[f"norm_{i}"]["scale" if what == "weight" else "bias"]
+        agree(np.linalg.norm(discriminated[name][1][parameter]), norm)

@@ -9,14 +9,7 @@ from support.laws import close, numbers
 from spnr_jax.kernels.compositing import composite, volume_weights
 from spnr_jax.kernels.imaging import resize_bilinear, srgb_to_linear
 from spnr_jax.kernels.numerics import normalize
-from spnr_jax.nn.paper_layers import (
-    BRIGHTNESS_AND_HUE,
-    Discriminator,
-    RadianceField,
-    UNet3D,
-    Upsampler,
-    whiten_materials,
-)
+from spnr_jax.nn.paper_layers import BRIGHTNESS_AND_HUE, RadianceField, Upsampler, whiten_materials
 
 
 class TestMaterials:
@@ -29,43 +22,6 @@ class TestMaterials:
         close(srgb_to_linear(jnp.asarray(encoded, jnp.float32)), colors, atol=1e-5)
         close(whiten_materials(jnp.array([[0.0], [0.5], [1.0]])), np.array([[-1.0], [0.0], [1.0]]))
         assert jnp.isfinite(jax.grad(lambda x: whiten_materials(x).sum())(jnp.zeros((1, 3)))).all()
-
-
-ROWS, VALUES = jnp.asarray(np.random.default_rng(0).integers(0, 513, (2, 20)), jnp.int32), numbers(1, 2, 20, 3)
-
-
-@pytest.fixture(scope="module")
-def unet():
-    module = UNet3D(resolution=8, base_width=4, num_stages=2, num_groups=2)
-    return jax.jit(module.apply), jax.jit(module.init)(jax.random.key(0), ROWS, VALUES)
-
-
-class TestUNet3D:
-    def test_without_its_decoder_the_stem_alone_reaches_the_output(self, unet):
-        """Skips are additions: blocks of zeros add relu(bias) = 0 to what the stem sends across."""
-        apply, variables = unet
-        whole = variables["params"]
-        silent = {name: b if name == "stem" else jax.tree.map(jnp.zeros_like, b) for name, b in whole.items()}
-        stem, out = (apply({"params": params}, ROWS, VALUES) for params in (silent, whole))
-        assert (stem >= 0).all()
-        assert (stem > 0).any()
-        assert (out >= stem).all(), "a decoder block adds its ReLU"
-        assert (out > stem).any()
-
-    def test_moving_the_points_by_whole_coarse_voxels_moves_the_volume_with_them(self):
-        """Far from the border; the statistics of a group do not see where in the volume its voxels are."""
-        module = UNet3D(resolution=32, base_width=4, num_stages=1, num_groups=2)
-        cells, values = np.random.default_rng(3).integers(12, 16, (1, 20, 3)), numbers(4, 1, 20, 3)
-        variables = jax.jit(module.init)(jax.random.key(0), jnp.zeros((1, 20), jnp.int32), values)
-        run = jax.jit(module.apply)
-
-        def volume(shift):
-            rows = (cells + shift) @ np.array([32**2, 32, 1])
-            return np.asarray(run(variables, jnp.asarray(rows, jnp.int32), values))[0]
-
-        still, moved = volume(0), volume(np.array([4, 2, -2]))
-        close(moved[12:24, 10:22, 6:18], still[8:20, 8:20, 8:20], rtol=1e-3, atol=2e-4)
-        assert np.abs(still[8:20, 8:20, 8:20] - still[4:16, 6:18, 10:22]).max() > 0.1
 
 
 FIELD = RadianceField(width=6, num_features=7, direction_frequencies=2)
@@ -83,24 +39,6 @@ def everything(module, x, directions):
 FIELD_VARIABLES = jax.jit(lambda key: FIELD.init(key, X, DIRECTIONS, method=everything))(jax.random.key(0))
 FIELD_VARIABLES = jax.tree.map(lambda x: x + 0.3 * numbers(2, *x.shape), FIELD_VARIABLES)
 apply_field = jax.jit(lambda x, directions: FIELD.apply(FIELD_VARIABLES, x, directions, method=everything))
-
-
-def test_finishing_the_composited_hidden_layer_composites_the_features_of_every_sample():
-    _, rgb, hidden, weights, view, finished = apply_field(X, DIRECTIONS)
-    params = jax.tree.map(np.float64, FIELD_VARIABLES["params"])
-    per_sample = np.float64(hidden) @ params["features"]["kernel"] + params["feature_bias"]
-    per_sample = per_sample + np.float64(view)[..., None, 3:]
-    colors = np.concatenate([np.float64(rgb) - 1, per_sample], axis=-1)  # on white: colours above it are added to it
-    expected = np.einsum("...s,...sf->...f", np.float64(weights), colors) + np.eye(7)[:3].sum(axis=0)
-    close(finished, expected, atol=1e-5)
-
-
-def test_the_density_does_not_see_the_direction_and_colour_and_features_do():
-    density, rgb, _, _, _, rest = apply_field(X, DIRECTIONS)
-    other_density, other_rgb, _, _, _, other_rest = apply_field(X, -DIRECTIONS)
-    close(other_density, density, rtol=0, atol=0)
-    assert (jnp.abs(other_rgb - rgb) > 1e-4).any()
-    assert (jnp.abs(other_rest - rest) > 1e-4).any()
 
 
 def test_a_field_that_does_not_see_the_direction_has_no_weights_for_it_and_one_colour_from_all_sides():
@@ -129,15 +67,3 @@ def test_a_fresh_upsampler_gives_the_bilinear_picture():
     x = numbers(0, 2, 4, 6, 5)
     found = jax.jit(lambda key: Upsampler(width=4).init_with_output(key, x)[0])(jax.random.key(0))
     close(found, resize_bilinear(x[..., :3], 8, 12), rtol=0, atol=0)
-
-
-def test_condition_and_mask_change_the_discriminators_mind_and_other_images_do_not():
-    image, condition, mask = numbers(0, 2, 24, 24, 3), numbers(1, 2, 24, 24, 3), numbers(2, 2, 24, 24) > 0
-    module = Discriminator(width=4, num_groups=2)
-    variables = jax.jit(module.init)(jax.random.key(0), image, condition, mask)
-    apply = jax.jit(module.apply)
-    logits = apply(variables, image, condition, mask)
-    assert (jnp.abs(apply(variables, image, 1 - condition, mask) - logits) > 1e-4).any()
-    assert (jnp.abs(apply(variables, image, condition, ~mask) - logits) > 1e-4).any()
-    other = jnp.concatenate([1 - image[:1], image[1:]])
-    close(apply(variables, other, condition, mask)[1], logits[1])

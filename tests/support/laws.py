@@ -154,13 +154,6 @@ def points_law(function, *arguments, shared=0, rtol=1e-5, atol=1e-6):
     close(few, jax.tree.map(lambda x: x[..., :5], whole), rtol, atol)
 
 
-def gradient_law(function, *arguments, rtol=1e-3):
-    """The float32 gradient of a random projection is finite and equals float64's, which equals central differences."""
-    (_, single), (_, double) = in_both_precisions(function, arguments, differences=True)
-    for s, d in zip(single, double, strict=True):
-        close(s, d, rtol=rtol, atol=rtol * np.abs(d).max() + 1e-12)
-
-
 KINDS = ("spread", "mixed", "equal", "ties", "one-hot", "zeros")
 TINY = 1e-37  # a float32 has all its digits above it
 hypotheses = settings(

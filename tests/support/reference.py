@@ -84,26 +84,6 @@ def trilinear(volume, position):
     return sum((w * volume[voxel] for voxel, w in trilinear_taps(position, len(volume))), np.zeros(volume.shape[-1]))
 
 
-def convolution(x, kernel, stride=1, padding=1):
-    """Correlation of one channels-last array with a kernel (*window, in, out), output by output."""
-    x, kernel = np.float64(x), np.float64(kernel)
-    n, window = x.ndim - 1, kernel.shape[0]
-    x = np.pad(x, [*[(padding, padding)] * n, (0, 0)])
-    shape = [(size - window) // stride + 1 for size in x.shape[:-1]]
-    out = np.zeros((*shape, kernel.shape[-1]))
-    for place in np.ndindex(*shape):
-        patch = x[tuple(slice(stride * i, stride * i + window) for i in place)]
-        out[place] = np.tensordot(patch, kernel, axes=n + 1)
-    return out
-
-
-def repeat_twice(x):
-    """Nearest x2 on every axis but the last."""
-    for axis in range(x.ndim - 1):
-        x = np.repeat(x, 2, axis=axis)
-    return x
-
-
 def bilinear(x, height, width):
     """One image resized with half-pixel centres, clamped at the border."""
     out = np.zeros((height, width, x.shape[-1]))
@@ -130,14 +110,14 @@ def area_downsample(image, size):
     return out
 
 
-def group_norm(x, groups, scale, bias, epsilon=1e-5):
+def group_norm(x, groups, epsilon=1e-5):
     """One array (*space, features), each group of consecutive channels to zero mean and unit variance."""
     x, width = np.float64(x), x.shape[-1] // groups
     out = np.empty_like(x)
     for g in range(groups):
         part = x[..., g * width : (g + 1) * width]
         out[..., g * width : (g + 1) * width] = (part - part.mean()) / math.sqrt(part.var() + epsilon)
-    return out * scale + bias
+    return out
 
 
 def softplus(x):

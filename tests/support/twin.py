@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,12 +27,12 @@ def load():
 
 def config(arrays: Arrays) -> TrainConfig:
     """The sizes that are timed as `tiny`, with the discriminator and R1 of the fixture."""
-    named, ours = json.loads(str(arrays["meta"]))["config"], bench.our_config("tiny")
+    theirs, ours = json.loads(str(arrays["meta"]))["config"], bench.our_config("tiny")
     loss = dataclasses.replace(
         ours.loss,
-        r1_gamma=named["r1_gamma"],
-        r1_interval=named["r1_every"],
-        discriminator_width=named["disc_width"],
+        r1_gamma=theirs["r1_gamma"],
+        r1_interval=theirs["r1_every"],
+        discriminator_width=theirs["disc_width"],
     )
     return dataclasses.replace(ours, loss=loss)
 
@@ -41,13 +42,17 @@ def inputs(arrays: Arrays) -> Arrays:
     return {name.removeprefix("in/"): x for name, x in arrays.items() if name.startswith("in/")}
 
 
+def named(arrays: Arrays, prefix: str) -> dict[str, jax.Array]:
+    """The arrays whose names begin so, under the rest of their names."""
+    return {k.removeprefix(prefix): jnp.asarray(v) for k, v in arrays.items() if k.startswith(prefix)}
+
+
 def _conv(x):
-    return np.moveaxis(x, (0, 1), (-1, -2))
+    return jnp.moveaxis(x, (0, 1), (-1, -2))
 
 
-def generator(arrays: Arrays, prefix: str = "param/gen.") -> tuple[dict, dict]:
-    """(params, batch_stats) of the generator; with prefix "train/grad/gen." its gradients, where they are stored."""
-    get = {k.removeprefix(prefix): jnp.asarray(v) for k, v in arrays.items() if k.startswith(prefix)}
+def generator(get: Mapping[str, jax.Array]) -> tuple[dict, dict]:
+    """(params, batch_stats) of the generator; its gradients by the given arrays have the twin's names."""
     pointnet = {"out": {"kernel": get["points.out.weight"].T, "bias": get["points.out.bias"]}}
     stats = {}
     for i in range(3):
@@ -82,9 +87,8 @@ def generator(arrays: Arrays, prefix: str = "param/gen.") -> tuple[dict, dict]:
     return params, {"encoder": {"pointnet": stats}}
 
 
-def discriminator(arrays: Arrays, prefix: str = "param/disc.") -> dict:
-    """Parameters of the discriminator."""
-    get = {k.removeprefix(prefix): jnp.asarray(v) for k, v in arrays.items() if k.startswith(prefix)}
+def discriminator(get: Mapping[str, jax.Array]) -> dict:
+    """Parameters of the discriminator, likewise."""
     params = {f"kernel_{i}": _conv(get[f"convs.{i}.weight"]) for i in range(5)}
     params |= {f"bias_{i}": get[f"convs.{i}.bias"] for i in (0, 4)}
     norms = {f"norm_{i}": {"scale": get[f"norms.{i}.weight"], "bias": get[f"norms.{i}.bias"]} for i in (1, 2, 3)}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support import reference
-from support.laws import close, hypotheses, numbers
+from support.laws import close, hypotheses
 from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
@@ -80,13 +80,6 @@ class TestShares:
         share, left = compute_blend_weights(*map(jnp.asarray, (dense * tau, *others)))
         expected, behind = reference.shares(dense * tau, *others, blending.COMPARED)
         close((share / dense, left), (expected / dense, behind), rtol=2e-5, atol=2e-6)
-
-    def test_layers_that_are_well_apart_add_up_to_the_opacity_of_their_optical_depth(self):
-        depth = np.repeat([1.0, 2.0, 3.0, 5.0], 6)[:, None] + 0.04 * np.sort(numbers(0, 4, 6), axis=1).reshape(-1, 1)
-        tau = numbers(1, 24, 1, low=0.0, high=0.4)
-        share, left = compute_blend_weights(tau, jnp.asarray(depth, jnp.float32), jnp.full((24, 1), 0.1))
-        close(np.sum(share), -np.expm1(-np.sum(tau)), rtol=1e-5)
-        close(left[6:12], np.full((6, 1), np.exp(-np.sum(tau[:6]))), rtol=1e-5)
 
 
 class TestEntries:
