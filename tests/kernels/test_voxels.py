@@ -8,7 +8,7 @@ from jax import lax
 from support.laws import close, numbers, same_bits
 
 from spnr_jax.kernels import voxels
-from spnr_jax.kernels.voxels import mean_contributions, row_of, scatter_conv, scatter_mean
+from spnr_jax.kernels.voxels import mean_contributions, scatter_conv, scatter_mean
 
 D = 4
 POSITIONS = 1.2 * numbers(0, 2, 3, 12, 3)  # some lie outside the box, and several share a voxel
@@ -26,10 +26,6 @@ class TestLocate:
         cell, offset = locate(jnp.array([coordinate, 0.0, -0.75]), D)
         np.testing.assert_array_equal(cell, [voxel, 2, 0])
         close(offset, np.array([(np.float32(coordinate) + 1) * 2 - voxel - 0.5, -0.5, 0.0]))
-
-    def test_rows_run_through_x_first_and_what_is_not_valid_goes_to_the_spare_row(self):
-        cell = jnp.array([[1, 2, 3], [1, 2, 3]], jnp.int32)
-        np.testing.assert_array_equal(row_of(cell, jnp.array([True, False]), D), [1 + 4 * 2 + 16 * 3, 64])
 
 
 class TestScatterMean:
@@ -57,19 +53,6 @@ class TestScatterMean:
         fills = extra, extra[:, :2], jnp.zeros(5, bool)
         padded = (jnp.concatenate(pair) for pair in zip(self.cloud, fills, strict=True))
         same_bits(scatter(*padded, D), scatter(*self.cloud, D))
-
-    def test_no_point_gives_zeros_and_zero_gradients(self):
-        positions, features, mask = self.cloud
-
-        def total(features, mask):
-            volume, occupancy = scatter_mean(positions, features, mask, D)
-            return jnp.sum(volume) + jnp.sum(occupancy)
-
-        value, gradient = jax.jit(jax.value_and_grad(total))(features, jnp.zeros_like(mask))
-        assert value == 0
-        assert (gradient == 0).all()
-        empty = scatter_mean(jnp.zeros((0, 3)), jnp.zeros((0, 2)), jnp.zeros(0, bool), D)
-        assert all((x == 0).all() for x in empty)
 
 
 class TestScatterConv:

@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import tiny_model
+from support import surfel_clouds, tiny_model
 from support.laws import close, numbers
 
 from spnr_jax.kernels import losses
-from spnr_jax.kernels.cameras import camera_rays, intersect_box, look_at, pinhole, resize
-from spnr_jax.kernels.records import PointCloud
+from spnr_jax.kernels.cameras import camera_rays, intersect_box, resize
 from spnr_jax.method import inference
 
 MODEL, SIZE, NUM_POINTS = tiny_model.MODEL, tiny_model.SIZE, 32
@@ -25,16 +24,13 @@ FIRST = np.arange(NUM_POINTS) == 0
 
 def cloud(positions=RANDOM, mask=None, **materials):
     """One object (1, points, ...); materials are grey unless they are given."""
-    values = {"base_color": np.full((NUM_POINTS, 3), 0.5), "roughness": np.full(NUM_POINTS, 0.5)}
-    values |= {"metallic": np.zeros(NUM_POINTS)} | materials
-    arrays = {name: jnp.asarray(x, jnp.float32)[None] for name, x in {"positions": positions, **values}.items()}
-    return PointCloud(**arrays, mask=jnp.ones((1, NUM_POINTS), bool) if mask is None else jnp.asarray(mask)[None])
+    points = surfel_clouds.cloud(positions, **materials)
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], points if mask is None else points.replace(mask=mask))
 
 
 def camera(eye=(0.5, 0.8, 3.0), target=(0.0, 0.0, 0.0), field_of_view=0.9):
     """One view (1, 1, ...) of one object."""
-    eye, target, up = (jnp.array(x, jnp.float32).reshape(1, 1, 3) for x in (eye, target, (0.0, 1.0, 0.0)))
-    return pinhole(look_at(eye, target, up), field_of_view, SIZE, SIZE)
+    return jax.tree.map(lambda x: x[None, None], surfel_clouds.camera(SIZE, eye, field_of_view, target))
 
 
 @pytest.fixture(scope="module")

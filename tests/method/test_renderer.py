@@ -19,6 +19,7 @@ from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Encoder
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
+NEAR = dataclasses.replace(CONFIG, sampling=dataclasses.replace(CONFIG.sampling, reach=1))
 open_path = jax.jit(voxels.open_path, static_argnames="num_cells")
 
 
@@ -34,14 +35,6 @@ def encode(variables, cloud):
 @pytest.fixture(scope="module")
 def encoded(variables):
     return encode(variables, cloud())
-
-
-def near_points(config, reach):
-    return dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, reach=reach))
-
-
-def scene(volume):
-    return Scene(volume=volume, occupied=jnp.ones(volume.shape[:-1], bool))
 
 
 def render(variables, volume, camera, **options):
@@ -98,8 +91,8 @@ class TestCloud:
 
     @pytest.mark.parametrize("materials", [(), ("roughness",), ("base_color", "metallic")], ids=str)
     def test_materials_that_the_config_leaves_out_are_not_read(self, materials):
-        config = tiny_model.with_encoder(CONFIG, materials=materials).encoder
-        module, unread = Encoder(config), {"base_color", "roughness", "metallic"} - set(materials)
+        module = Encoder(dataclasses.replace(CONFIG.encoder, materials=materials))
+        unread = {"base_color", "roughness", "metallic"} - set(materials)
         spoilt = dataclasses.replace(
             cloud(), **{name: jnp.full_like(getattr(cloud(), name), jnp.nan) for name in unread}
         )
@@ -136,7 +129,7 @@ class TestViews:
         @jax.jit
         def densities(rays, distances):
             module = inference.network(CONFIG).bind(variables)
-            everywhere = scene(jnp.ones((1, 8, 8, 8, 4)))
+            everywhere = Scene(volume=jnp.ones((1, 8, 8, 8, 4)), occupied=jnp.ones((1, 8, 8, 8), bool))
             field, _ = module.make_field(everywhere, rays, jnp.zeros(rays.origins.shape[:-1], jnp.int32))
             return field(distances).density
 
@@ -174,15 +167,13 @@ class TestEmptySpace:
             return jnp.sum(jnp.sin(rendering.image)) + jnp.sum(rendering.acc), rendering
 
         both = jax.jit(jax.value_and_grad(total, has_aux=True), static_argnums=1)
-        ((_, expected), wanted), ((_, ours), gradient) = (
-            both(encoded.volume, c) for c in (CONFIG, near_points(CONFIG, 1))
-        )
+        ((_, expected), wanted), ((_, ours), gradient) = (both(encoded.volume, c) for c in (CONFIG, NEAR))
         close(ours, expected, atol=2e-4)
         assert (np.asarray(expected.depth) > 0).any()
         assert np.linalg.norm(gradient - wanted) < 1e-3 * np.linalg.norm(wanted)
 
     def test_rays_that_miss_the_points_are_white_and_transparent(self, variables, encoded):
-        rendering = tiny_model.render(variables, encoded, camera(), config=near_points(CONFIG, 1))
+        rendering = tiny_model.render(variables, encoded, camera(), config=NEAR)
         rays = cameras.view_rays(cameras.resize(camera(), *rendering.acc.shape[-2:]))
         near, far, _ = jax.jit(cameras.intersect_box)(rays.origins, rays.directions)
         cells = 2 * CONFIG.encoder.volume_resolution
@@ -196,16 +187,16 @@ class TestEmptySpace:
 
     def test_what_a_ray_draws_does_not_depend_on_the_rays_beside_it(self, variables, encoded):
         """Devices of a mesh pack their own rays into blocks: a step must draw there what it draws on one device."""
-        config, generic = near_points(CONFIG, 1), camera(target=0.013)
+        generic = camera(target=0.013)
 
         @partial(jax.jit, static_argnames="block")
         def jittered(key, block):
             options = RenderOptions(block=block)
-            return inference.network(config).bind(variables).render(encoded, generic, options, key)
+            return inference.network(NEAR).bind(variables).render(encoded, generic, options, key)
 
         few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
         close(few, many, atol=1e-5)
-        still = tiny_model.render(variables, encoded, generic, config=config)
+        still = tiny_model.render(variables, encoded, generic, config=NEAR)
         assert np.abs(np.asarray(many.image) - np.asarray(still.image)).max() > 1e-3, "a key moves the samples"
 
     def test_occupied_voxels_are_those_of_the_points(self, encoded):

@@ -14,6 +14,7 @@ from support.tiny_untrained import CONFIG
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import metrics
 from spnr_jax.kernels.cameras import look_at, project
+from spnr_jax.kernels.imaging import linear_to_srgb
 from spnr_jax.kernels.records import Camera, PointCloud, unstack
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import METRICS, flip
@@ -151,10 +152,6 @@ def skewed_camera() -> Camera:
     return Camera(cam_to_world=pose, intrinsics=intrinsics, height=18, width=23)
 
 
-def encode(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def loop_rays(camera: Camera):
     """(row, column, eye, unit direction, plane coordinates) of every pixel, float64."""
     pose, k = np.asarray(camera.cam_to_world, np.float64), np.asarray(camera.intrinsics, np.float64)
@@ -176,7 +173,7 @@ def loop_splat(cloud: PointCloud, camera: Camera, radius: float):
         ):
             x, y, z = pose[:, :3].T @ (position - eye)
             if -z > 0 and np.hypot(*(plane * -z - [x, y])) <= radius and -z < best:
-                best, acc[row, column], image[row, column] = -z, 1, encode(color)
+                best, acc[row, column], image[row, column] = -z, 1, linear_to_srgb(color)
     return image, acc
 
 
@@ -193,7 +190,7 @@ def loop_nearest(cloud: PointCloud, camera: Camera, radius: float):
                 first = min(first, max(b - np.sqrt(discriminant), 0))
         if np.isfinite(first):
             index = np.argmin(np.linalg.norm(positions - (eye + first * direction), axis=-1))
-            acc[row, column], image[row, column] = 1, encode(colors[index])
+            acc[row, column], image[row, column] = 1, linear_to_srgb(colors[index])
     return image, acc
 
 

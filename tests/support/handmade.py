@@ -15,24 +15,14 @@ def plain(color=GREY, roughness=0.8, metallic=0.0) -> Material:
 
 def box(centre=(0, 0, 0), half=(0.5, 0.5, 0.5), material=None, texcoords=False) -> Part:
     """Six sides of two triangles each, in the order -x +x -y +y -z +z, counter-clockwise from outside."""
-    positions, faces = [], []
-    for axis in range(3):
-        for sign in (-1, 1):
-            a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-            corners = [sign * np.eye(3)[axis] + u * a + v * b for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-            start = len(positions)
-            positions += corners
-            loop = (0, 1, 2, 3) if sign > 0 else (0, 3, 2, 1)
-            faces += [
-                [start + loop[0], start + loop[1], start + loop[2]],
-                [start + loop[0], start + loop[2], start + loop[3]],
-            ]
-    square = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], (6, 1))
+    corners = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    sides = [np.roll(np.insert(corners, 0, sign, axis=1), axis, axis=1) for axis in range(3) for sign in (-1, 1)]
+    faces = np.array([[[0, 3, 2], [0, 2, 1]], [[0, 1, 2], [0, 2, 3]]] * 3) + 4 * np.arange(6)[:, None, None]
     return Part(
-        positions=np.array(positions) * half + centre,
-        faces=np.array(faces, dtype=np.int64),
+        positions=np.concatenate(sides) * half + centre,
+        faces=faces.reshape(-1, 3),
         material=material or plain(),
-        texcoords=square if texcoords else None,
+        texcoords=np.tile((corners + 1) / 2, (6, 1)) if texcoords else None,
     )
 
 

@@ -32,11 +32,6 @@ WITHOUT_UPSAMPLER = dataclasses.replace(MODEL, image_resolution=8)
 NUM_POINTS = 40
 
 
-def with_encoder(model, **changes):
-    """A network with other sizes of its encoder."""
-    return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, **changes))
-
-
 def cloud():
     """Points of two objects."""
     return PointCloud(
