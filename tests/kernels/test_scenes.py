@@ -19,10 +19,6 @@ def table_scene(tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return (positions @ turn.T)[order], part[order]
 
 
-def same(mask: np.ndarray, other: np.ndarray) -> bool:
-    return bool(np.array_equal(mask, other))
-
-
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_the_dominant_plane_is_the_table_and_takes_its_noise_along(tilt, noise):
@@ -40,9 +36,9 @@ def test_clusters_are_numbered_by_their_size_and_do_not_depend_on_the_order_of_t
     positions, part = table_scene()
     positions, part = positions[part < 3], part[part < 3]
     labels = scenes.find_clusters(positions)
-    assert same(labels, part)
+    np.testing.assert_array_equal(labels, part)
     turned = np.random.default_rng(3).permutation(len(part))
-    assert same(scenes.find_clusters(positions[turned]), labels[turned])
+    np.testing.assert_array_equal(scenes.find_clusters(positions[turned]), labels[turned])
 
 
 def test_clusters_are_those_of_a_plain_loop_over_voxels():
@@ -65,7 +61,7 @@ def test_clusters_are_those_of_a_plain_loop_over_voxels():
 def test_what_stands_on_the_table_is_cut_out_ball_by_ball(nth):
     positions, part = table_scene(0.2)
     rows, said = object_of(positions, nth=nth)
-    assert same(part[rows], np.full(BALLS[nth - 1][1], nth - 1))
+    np.testing.assert_array_equal(part[rows], np.full(BALLS[nth - 1][1], nth - 1))
     assert [line.split(":")[0] for line in said] == ["--remove-plane", "--object"]
 
 
@@ -77,7 +73,7 @@ def object_of(positions, nth=None):
 def test_a_box_holds_what_lies_on_its_borders_and_one_without_points_is_named():
     positions = np.array([[0.0, 0, 0], [1, 1, 1], [2, 0, 0]])
     inside = scenes.is_inside(positions, (0, 0, 0, 1, 1, 1))
-    assert same(inside, np.array([True, True, False]))
+    np.testing.assert_array_equal(inside, np.array([True, True, False]))
     assert scenes.describe_crop(2, 3, (0, 0, 0, 1, 1, 1), *positions[[0, 1]]) == "--crop: 2 of 3 points lie inside"
     with pytest.raises(ValueError, match=r"--crop 5 5 5 6 6 6: none of the 29,000 points, they lie in the box 0"):
         scenes.describe_crop(0, 29_000, (5, 5, 5, 6, 6, 6), *positions[[0, 2]])
@@ -106,4 +102,4 @@ def test_few_points_of_any_size_have_clusters_and_perhaps_a_plane(count, size):
 
 def test_a_point_at_the_end_of_the_world_is_a_cluster_of_its_own():
     labels = scenes.find_clusters(np.concatenate([[[1e35, 0, 0]], spiral(5000)]))
-    assert same(labels, np.arange(5001) == 0)
+    np.testing.assert_array_equal(labels, np.arange(5001) == 0)

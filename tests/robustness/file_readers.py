@@ -24,6 +24,16 @@ from support.packed_meshes import draco_square, meshopt_files
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
 
+from data_gen.plan import tasks
+from data_gen.store import check
+from spnr_jax import presets
+from spnr_jax.config import SurfelConfig
+from spnr_jax.formats import clouds, data_sets, gaussian_files, meshes, surface_points
+from spnr_jax.methods import from_dict, to_dict
+from spnr_jax.tools import frame
+from spnr_jax.training import checkpoint, trainer
+from spnr_jax.training.weights import Trained, read_weights, variable_shapes
+
 Files = dict[str, bytes]
 
 MOST_POINTS = 32
@@ -32,8 +42,6 @@ TEXELS = np.random.default_rng(7).integers(0, 256, (4, 4, 4))
 
 def read_cloud(folder: Path, main: str) -> None:
     """What `spnr render` and `spnr view` do with a file of points or a mesh."""
-    from spnr_jax.formats import clouds
-
     placed = clouds.place_cloud(folder / main, num_points=MOST_POINTS, report=lambda line: None)
     check_cloud(placed.cloud, MOST_POINTS)
     assert np.isfinite(placed.origin).all()
@@ -42,8 +50,6 @@ def read_cloud(folder: Path, main: str) -> None:
 
 def read_mesh(folder: Path, main: str) -> None:
     """What the generator of data makes of a mesh file, and `spnr render` with either choice of transparent parts."""
-    from spnr_jax.formats import clouds, meshes, surface_points
-
     with contextlib.suppress(ValueError):  # more is refused for references than for pictures
         surface_points.sample_surface(meshes.load_mesh(folder / main), MOST_POINTS, 0)
     with contextlib.suppress(ValueError):
@@ -68,27 +74,19 @@ def check_cloud(cloud, most: int | None = None) -> None:
 
 def read_config(folder: Path, main: str) -> None:
     """A run folder's config."""
-    from spnr_jax.methods import from_dict, to_dict
-    from spnr_jax.training.checkpoint import read_config
-
-    config = read_config(folder)
+    config = checkpoint.read_config(folder)
     hash(config)  # it is a static argument of jit
     assert from_dict(to_dict(config)) == config, "a config that is not itself again"
 
 
 def read_metrics(folder: Path, main: str) -> None:
     """The rows that a report draws."""
-    from spnr_jax.training.trainer import read_rows
-
-    for row in read_rows(folder):
+    for row in trainer.read_rows(folder):
         assert all(isinstance(value, int | float) for value in row.values()), "a row with a value that is no number"
 
 
 def read_dataset(folder: Path, main: str) -> None:
     """What `spnr-data check` says, and every object of a data set, as training reads it."""
-    from data_gen.store import check
-    from spnr_jax.formats import data_sets
-
     with contextlib.suppress(ValueError), contextlib.redirect_stdout(io.StringIO()):
         assert isinstance(check.check(folder), bool)
     dataset = data_sets.open_dataset(folder)
@@ -107,23 +105,16 @@ def read_dataset(folder: Path, main: str) -> None:
 
 def read_list(folder: Path, main: str) -> None:
     """A test split that a user names."""
-    from data_gen.plan import tasks
-
     assert set(tasks.read_test_list(folder / main, {"a", "b"})) <= {"a", "b"}
 
 
 def read_network(folder: Path, main: str) -> None:
     """A file of weights."""
-    from spnr_jax.training.weights import Trained, read_weights
-
     assert isinstance(read_weights(folder / main), Trained)
 
 
 def read_upload(folder: Path, main: str) -> None:
     """What a browser's file becomes; nothing of it stays on the disk."""
-    from spnr_jax.formats import clouds
-    from spnr_jax.tools import frame
-
     before, read = set(folder.iterdir()), functools.partial(clouds.read_cloud, num_points=MOST_POINTS, up="auto")
     try:
         name = (folder / "name.txt").read_text("utf-8", errors="replace")
@@ -228,8 +219,6 @@ def scenes() -> list[Files]:
 
 def splats() -> list[Files]:
     """Packed splats of both versions of .spz, and a compressed .ply."""
-    from spnr_jax.formats import gaussian_files
-
     content = gzip.decompress(gaussian_files.spz_of(splat_balls.ball(12)))
     spz = [{"cloud.spz": gzip.compress(content[:4] + bytes([version]) + content[5:], mtime=0)} for version in (2, 3)]
     return [*spz, {"cloud.ply": packed_splats(WHOLE.positions / 8, 255)}]
@@ -237,9 +226,6 @@ def splats() -> list[Files]:
 
 def configs() -> list[Files]:
     """A config of each preset."""
-    from spnr_jax import presets
-    from spnr_jax.methods import to_dict
-
     return [{"config.json": json.dumps(to_dict(make()), indent=2).encode()} for make in presets.PRESETS.values()]
 
 
@@ -254,11 +240,6 @@ def datasets() -> list[Files]:
 
 def weights() -> list[Files]:
     """A file of weights of a very small network."""
-    from spnr_jax import presets
-    from spnr_jax.config import SurfelConfig
-    from spnr_jax.methods import to_dict
-    from spnr_jax.training.weights import variable_shapes
-
     config = dataclasses.replace(presets.surfels_tiny(), model=SurfelConfig(widths=(4, 6), top=4))
     described = np.frombuffer(json.dumps(to_dict(config)).encode(), np.uint8)
     halves = {name: np.zeros(x.shape, np.float16) for name, x in variable_shapes(config).items()}
