@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import surfel_clouds, tiny_dataset, tiny_untrained
+from support import reference, surfel_clouds, tiny_dataset, tiny_untrained
 from support.laws import close
 from support.tiny_untrained import CONFIG
 
@@ -153,27 +153,24 @@ def skewed_camera() -> Camera:
 
 
 def loop_rays(camera: Camera):
-    """(row, column, eye, unit direction, plane coordinates) of every pixel, float64."""
+    """(place, eye, unit direction) of every pixel, float64."""
     pose, k = np.asarray(camera.cam_to_world, np.float64), np.asarray(camera.intrinsics, np.float64)
-    for row in range(camera.height):
-        for column in range(camera.width):
-            plane = np.array([(column + 0.5 - k[0, 2]) / k[0, 0], -(row + 0.5 - k[1, 2]) / k[1, 1]])
-            direction = pose[:, :3] @ [*plane, -1]
-            yield row, column, pose[:, 3], direction / np.linalg.norm(direction), plane
+    for place in np.ndindex(camera.height, camera.width):
+        yield place, pose[:, 3], reference.camera_ray(pose, k.diagonal()[:2], k[:2, 2], *place)
 
 
 def loop_splat(cloud: PointCloud, camera: Camera, radius: float):
     """The disc's definition in camera coordinates: it lies in the plane z = depth of its point."""
     pose = np.asarray(camera.cam_to_world, np.float64)
     image, acc = np.ones((camera.height, camera.width, 3)), np.zeros((camera.height, camera.width))
-    for row, column, eye, _, plane in loop_rays(camera):
-        best = np.inf
+    for place, eye, direction in loop_rays(camera):
+        best, (*across, along) = np.inf, pose[:, :3].T @ direction
         for position, color in zip(
             *(np.asarray(a)[cloud.mask] for a in (cloud.positions, cloud.base_color)), strict=True
         ):
             x, y, z = pose[:, :3].T @ (position - eye)
-            if -z > 0 and np.hypot(*(plane * -z - [x, y])) <= radius and -z < best:
-                best, acc[row, column], image[row, column] = -z, 1, linear_to_srgb(color)
+            if -z > 0 and np.hypot(*(np.array(across) * z / along - [x, y])) <= radius and -z < best:
+                best, acc[place], image[place] = -z, 1, linear_to_srgb(color)
     return image, acc
 
 
@@ -181,7 +178,7 @@ def loop_nearest(cloud: PointCloud, camera: Camera, radius: float):
     """Nearest-point shading to the letter: first find the intersection, then search the point nearest to it."""
     positions, colors = (np.asarray(a, np.float64)[cloud.mask] for a in (cloud.positions, cloud.base_color))
     image, acc = np.ones((camera.height, camera.width, 3)), np.zeros((camera.height, camera.width))
-    for row, column, eye, direction, _ in loop_rays(camera):
+    for place, eye, direction in loop_rays(camera):
         first = np.inf
         for offset in positions - eye:
             b = direction @ offset
@@ -190,7 +187,7 @@ def loop_nearest(cloud: PointCloud, camera: Camera, radius: float):
                 first = min(first, max(b - np.sqrt(discriminant), 0))
         if np.isfinite(first):
             index = np.argmin(np.linalg.norm(positions - (eye + first * direction), axis=-1))
-            acc[row, column], image[row, column] = 1, linear_to_srgb(colors[index])
+            acc[place], image[place] = 1, linear_to_srgb(colors[index])
     return image, acc
 
 

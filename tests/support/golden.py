@@ -33,20 +33,18 @@ def torus(count: int = 1000) -> spnr_jax.PointCloud:
 
 def table(count: int = 1500) -> spnr_jax.PointCloud:
     """A wooden top on four metal legs: boxes, each with points in the share of its area."""
-    boxes = [((0, 0.45, 0), (0.8, 0.05, 0.5))]
-    boxes += [((x, -0.05, z), (0.05, 0.45, 0.05)) for x in (-0.7, 0.7) for z in (-0.4, 0.4)]
-    sides = [(box, axis, sign) for box in range(len(boxes)) for axis in range(3) for sign in (-1, 1)]
-    extents = np.array([np.delete(boxes[box][1], axis) for box, axis, _ in sides])
-    shares = np.cumsum(extents.prod(axis=1)) / extents.prod(axis=1).sum()
+    middles = np.array([(0, 0.45, 0), *((x, -0.05, z) for x in (-0.7, 0.7) for z in (-0.4, 0.4))])
+    halves = np.array([(0.8, 0.05, 0.5), *[(0.05, 0.45, 0.05)] * 4])
+    areas = np.repeat(halves.prod(axis=1, keepdims=True) / halves, 2)  # of each box -x +x -y +y -z +z
+    shares = np.cumsum(areas) / areas.sum()
     u, v = sequence(count).T
-    side = np.minimum(np.searchsorted(shares, u), len(sides) - 1)
+    side = np.searchsorted(shares, u)
     before = np.concatenate([[0], shares])[side]
     inside = (u - before) / (shares[side] - before)  # which place in its own side a point has
-    positions = np.empty((count, 3))
-    for i, chosen in enumerate(side):
-        box, axis, sign = sides[chosen]
-        place = np.insert([2 * inside[i] - 1, 2 * v[i] - 1], axis, sign)
-        positions[i] = np.add(boxes[box][0], place * np.array(boxes[box][1]))
+    box, axis = side // 6, side % 6 // 2
+    place = np.stack([2 * (side % 2) - 1, 2 * inside - 1, 2 * v - 1], axis=1)
+    place = np.take_along_axis(place, np.array([[0, 1, 2], [1, 0, 2], [1, 2, 0]])[axis], axis=1)
+    positions = middles[box] + place * halves[box]
     top = (side < 6).astype(float)
     colors = top[:, None] * [0.35, 0.18, 0.08] + (1 - top[:, None]) * [0.6, 0.6, 0.62]
     return cloud(positions, base_color=colors, roughness=0.6 * top + 0.3 * (1 - top), metallic=1 - top)

@@ -8,7 +8,8 @@ import numpy as np
 
 def camera_ray(cam_to_world, focal, centre, row, column):
     """Unit direction through a pixel centre; OpenGL axes, row 0 at the top."""
-    local = np.array([(column + 0.5 - centre[0]) / focal, -(row + 0.5 - centre[1]) / focal, -1.0])
+    right, down = (np.array([column, row]) + 0.5 - centre) / focal
+    local = np.array([right, -down, -1.0])
     direction = np.asarray(cam_to_world, np.float64)[:, :3] @ local
     return direction / math.sqrt(direction @ direction)
 

@@ -91,14 +91,10 @@ def test_a_normal_given_on_a_sheet_keeps_its_sign():
 
 def cube(count):
     """Points, normals and spacing of a cube of side 1."""
-    u, v = 0.5 * even_square(count).T
     faces = [(axis, sign) for axis in range(3) for sign in (-1, 1)]
-    positions, normals = [], []
-    for axis, sign in faces:
-        place = np.insert(np.stack([u, v], axis=1), axis, 0.5 * sign, axis=1)
-        positions.append(place)
-        normals.append(np.broadcast_to(sign * np.eye(3)[axis], (count, 3)))
-    return np.float32(np.concatenate(positions)), np.float32(np.concatenate(normals)), count**-0.5
+    positions = [np.insert(0.5 * even_square(count), axis, 0.5 * sign, axis=1) for axis, sign in faces]
+    normals = np.repeat([sign * np.eye(3)[axis] for axis, sign in faces], count, axis=0)
+    return np.float32(np.concatenate(positions)), np.float32(normals), count**-0.5
 
 
 def ends(found, count):
