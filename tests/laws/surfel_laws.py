@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 from kernel_laws import FINITE, encode_srgb, sizes, unit, usual
+from scipy.ndimage import map_coordinates
 from support import reference
 from support.laws import TINY, Axis, Extremes, Law, close, extremes
 from support.surfel_clouds import surfels, tangents
@@ -252,6 +253,7 @@ def towards(rng):
     """Unit directions well inside the texels of a light's tables."""
     row = rng.integers(2, lighting.HEIGHT - 2, POINTS) + rng.uniform(0.6, 1.4, POINTS)
     column = rng.integers(0, lighting.WIDTH, POINTS) + rng.uniform(0.6, 1.4, POINTS)
+    column[0] = lighting.WIDTH  # where the azimuth begins anew
     polar, azimuth = np.pi * row / lighting.HEIGHT, 2 * np.pi * column / lighting.WIDTH
     return np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), -np.sin(polar) * np.cos(azimuth)])
 
@@ -262,6 +264,26 @@ def tables(rng, size):
 
 def mirrors(light, directions, roughness):
     return jnp.stack(lighting.reflect(Light(tables=light), list(directions), roughness))
+
+
+def mirrors_twin(light, directions, roughness):
+    """Linear between texels and between roughnesses; at a pole the azimuth is 0."""
+    x, y, z = directions
+    across = np.hypot(x, z)
+    azimuth = np.where(across > lighting.POLE, np.arctan2(x, -z), 0) % (2 * np.pi)
+    row = np.arctan2(across, y) / np.pi * lighting.HEIGHT - 0.5
+    column = azimuth / (2 * np.pi) * lighting.WIDTH + 0.5  # after the last one, which is put before the first
+    place = [np.clip(roughness, 0, 1) * (len(lighting.LEVELS) - 1), row, column]
+    around = np.pad(light[1:], ((0, 0), (0, 0), (1, 1), (0, 0)), mode="wrap")
+    return np.stack([map_coordinates(around[..., i], place, order=1, mode="nearest") for i in range(3)])
+
+
+@st.composite
+def any_mirror(draw):
+    """A map, directions along the axes among them, and roughnesses at the levels and beyond."""
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    roughness = rng.choice([-0.1, *lighting.LEVELS, 0.33, 1.1], 9)
+    return tables(rng, 1.0), draw(extremes(9, 3).map(some_normals)), roughness
 
 
 def arrives(light, visible, normal):
@@ -325,8 +347,9 @@ def is_a_picture(arguments, outputs):
 
 # fmt: off
 LIGHT = (
-    Law("reflect", mirrors, None, sizes("size of the light", 1e-30, 1e30,
-            lambda rng, v: (tables(rng, v), towards(rng), rng.choice(lighting.LEVELS[:-1], POINTS) + 0.1)), shared=1),
+    Law("reflect", mirrors, mirrors_twin, sizes("size of the light", 1e-30, 1e30,
+            lambda rng, v: (tables(rng, v), towards(rng), rng.choice(lighting.LEVELS[:-1], POINTS) + 0.1)), shared=1,
+        extremes=Extremes((any_mirror(),), floors=(FINITE,) * 3, rtol=1e-4, atol=lambda *x: 1e-4)),
     Law("arriving", arrives, None, sizes("size of the light", 1e-30, 1e30,
             lambda rng, v: (tables(rng, v), rng.uniform(size=(64, POINTS)), unit(rng.normal(size=(POINTS, 3))).T)),
         shared=1),

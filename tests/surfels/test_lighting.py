@@ -10,11 +10,11 @@ from support.surfel_clouds import surfels
 from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.records import Light
 from spnr_jax.surfels import lighting, skies
-from spnr_jax.surfels.lighting import HEIGHT, LEVELS, WIDTH, light_of, resample, solid_angles, texel_directions
+from spnr_jax.surfels.lighting import HEIGHT, WIDTH, light_of, resample, solid_angles, texel_directions
 from spnr_jax.surfels.sides import DIRECTIONS
 
 COLOR = np.array([0.3, 1.0, 2.0])
-irradiance, reflect, look_up = map(jax.jit, (lighting.irradiance, lighting.reflect, lighting.look_up))
+irradiance, reflect = map(jax.jit, (lighting.irradiance, lighting.reflect))
 arriving, project_harmonics = jax.jit(lighting.gather_irradiance), jax.jit(lighting.project_harmonics)
 harmonics = jax.jit(lighting.harmonics)
 
@@ -44,16 +44,6 @@ def test_all_tables_of_constant_light_are_that_light():
     towards = columns(numbers(0, 50, 3))
     for found in (irradiance(light, towards), reflect(light, towards, numbers(1, 50, low=0.0))):
         close(jnp.stack(found, axis=-1), np.broadcast_to(COLOR, (50, 3)), rtol=1e-4)
-
-
-def test_roughness_passes_through_the_levels_without_jumps():
-    light = jax.tree.map(jnp.asarray, light_of(envmap()))
-    towards = texel_directions(HEIGHT)[5, 7]
-    for level, roughness in enumerate(LEVELS):
-        expected = light.tables[1 + level, 5, 7]
-        for off in (-1e-6, 0, 1e-6):
-            found = reflect(light, columns(towards), jnp.full(1, roughness + off))
-            close(jnp.stack(found, axis=-1)[0], expected, rtol=1e-4)
 
 
 def test_everything_is_linear_in_the_map():
@@ -87,35 +77,6 @@ def test_another_size_keeps_the_energy_and_loses_no_lamp(size, height):
     assert small.shape == (height, 2 * height, 3)
     close(energy(small), energy(radiance), rtol=1e-4)
     assert small.min() >= 0
-
-
-class TestLookUp:
-    def table(self):
-        return jnp.asarray(envmap(4).reshape(-1, 3))
-
-    def test_the_middle_of_a_texel_has_its_value_and_half_way_the_mean_of_its_neighbours(self):
-        found = look_up(self.table(), columns(texel_directions(HEIGHT)))
-        close(jnp.stack(found, axis=-1), self.table(), rtol=1e-3, atol=1e-3)
-        corners = texel_directions(2 * HEIGHT)[2::2, 2::2][: HEIGHT - 1, : WIDTH - 1]
-        turned = np.stack(look_up(self.table(), columns(corners)), axis=-1).reshape(*corners.shape)
-        texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
-        mixed = sum(
-            (0.75, 0.25)[i] * (0.75, 0.25)[j] * texels[1 + -i :, 1 - j :][: HEIGHT - 1, : WIDTH - 1]
-            for i in (0, 1)
-            for j in (0, 1)
-        )
-        close(turned, mixed, rtol=1e-3, atol=1e-3)
-
-    def test_it_is_periodic_in_the_azimuth_and_finite_at_the_poles(self):
-        azimuth = jnp.asarray([0.0, 1e-7, -1e-7, 2 * np.pi, np.pi, -np.pi], jnp.float32)
-        towards = [jnp.sin(azimuth), 0 * azimuth, -jnp.cos(azimuth)]
-        found = np.stack(look_up(self.table(), towards), axis=-1)
-        close(found[:4], np.broadcast_to(found[0], (4, 3)), rtol=1e-4)
-        close(found[4], found[5], rtol=1e-4)
-        texels = np.asarray(self.table()).reshape(HEIGHT, WIDTH, 3)
-        close(found[0], texels[15:17, [0, -1]].mean(axis=(0, 1)), rtol=1e-4)
-        poles = [jnp.zeros(4), jnp.asarray([1.0, -1.0, 1.0000001, -1.0000001]), jnp.asarray([0.0, 0.0, -0.0, 1e-30])]
-        assert np.isfinite(np.stack(look_up(self.table(), poles))).all()
 
 
 def test_what_arrives_at_a_surfel_that_all_directions_see_is_nearly_its_irradiance():
