@@ -111,6 +111,14 @@ def two_lists(rng):
     return (*(np.sort(rng.uniform(-1, 1, (6, n))) for n in (5, 4)), rng.uniform(0, 3, (6, 9)), np.full(6, 1.5))
 
 
+@st.composite
+def two_marches(draw):
+    """Sorted lists with ties, within each and between them, up to the far side, and densities of any size."""
+    rng = np.random.default_rng(draw(seeds))
+    coarse, fine = (np.sort(rng.integers(0, draw(st.sampled_from([1, 6, 1000])), (3, n)) / 1000) for n in (5, 4))
+    return coarse, fine, draw(extremes(3, 9, signed=False)), np.ones(3)
+
+
 # fmt: off
 RAYS = (
     Law("stratified", middles, each(middles_twin, "(),()->(n),(m)"),
@@ -121,9 +129,11 @@ RAYS = (
         usual(lambda rng: (np.sort(rng.uniform(0, 2, (6, 8))), np.full(6, 2.5))), (1, 0)),
     Law("volume_weights", compositing.volume_weights, each(reference.volume_weights, "(n),(n)->(n),()"),
         (Axis("optical depth of a ray", 1e-32, 1, 1e36, layers),
-        Axis("number of samples", 1, 64, 4096, lambda rng, n: layers(rng, n=int(n)))), (1, 1), floors=(0.0, 1.0),
-        extremes=Extremes((extremes(3, BINS, signed=False), extremes(3, BINS, signed=False)), rtol=1e-5,
-        atol=lambda *x: 1e-12, check=add_up)),
+        Axis("number of samples", 1, 64, 4096, lambda rng, n: layers(rng, n=int(n))),
+        # the transmittance of each rounds to 1 in float32, and so would their product
+        Axis("number of thin samples", 1, 64, 4096, lambda rng, n: layers(rng, 1e-4, int(n)))), (1, 1),
+        floors=(0.0, 1.0), extremes=Extremes((extremes(3, BINS, signed=False), extremes(3, BINS, signed=False)),
+        rtol=1e-5, atol=lambda *x: 1e-12, check=add_up)),
     Law("composite", compositing.composite, each(reference.composite, "(n),(n,f),(f)->(f)"),
         sizes("size of the colours", 1e-40, 1e36, lambda rng, v: (shares(rng), v * rng.uniform(0, 1, (6, 128, 3)),
             np.ones((6, 3)))), (1, 2, 1), floors=(1.0,),
@@ -134,7 +144,7 @@ RAYS = (
         Extremes((marched(),), floors=lambda w, t, far: (float(far.max()), 1.0, 1.0), rtol=2e-6,
         atol=lambda w, t, far: 2e-6 * far.max() + TINY, check=between)),
     Law("union_weights", paper_method.union_weights, each(union_twin, "(c),(f),(n),()->(n)"), usual(two_lists),
-        (1, 1, 1, 0)),
+        (1, 1, 1, 0), Extremes((two_marches(),), floors=(FINITE,) * 4, rtol=1e-5, atol=lambda *x: 1e-6)),
 )
 # fmt: on
 
@@ -171,8 +181,10 @@ def on_grid(positions):
     return np.where(np.abs(positions) < 8, np.round(positions * 2**20) / 2**20, positions).astype(np.float32)
 
 
-anywhere = st.one_of(
-    extremes(POINTS, 3), seeds.map(lambda seed: 1.3 * np.random.default_rng(seed).uniform(-1, 1, (POINTS, 3)))
+anywhere = st.one_of(  # on the faces of voxels and of the box, too
+    extremes(POINTS, 3),
+    seeds.map(lambda seed: 1.3 * np.random.default_rng(seed).uniform(-1, 1, (POINTS, 3))),
+    seeds.map(lambda seed: np.random.default_rng(seed).integers(-5, 6, (POINTS, 3)) / 4),
 ).map(on_grid)
 volumes = st.sampled_from([1, 4]).flatmap(lambda n: extremes(n, n, n, 2))
 masks = st.tuples(seeds, st.sampled_from([0, 0.5, 1])).map(

@@ -236,9 +236,11 @@ def within_one(arguments, outputs):
 
 # fmt: off
 LISTS = (
-    # thin lists are a series, to 7e-9: no twin
+    # thin lists are a series, to 7e-9: no twin for all
     Law("blend weights", blending.compute_blend_weights, None,
         (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 1.0)),
+    Law("blend weights of a thin list", blending.compute_blend_weights, shares_twin,
+        (Axis("optical depth of an entry", 1e-4, 5e-3, 1e-2, lists),), floors=(0.0, 1.0), agreement=1e-7),
     Law("blend weights beside the loop", blending.compute_blend_weights, shares_twin,
         (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 1.0),
         extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,

@@ -14,7 +14,6 @@ from support.surfel_clouds import camera, even_square, shape, surfels
 
 from spnr_jax.kernels import cameras
 from spnr_jax.surfels import blending, splatting
-from spnr_jax.surfels.blending import compute_blend_weights
 
 TOTAL = 2**15  # entries, and 500 points in most scenes: few programs are compiled
 
@@ -66,20 +65,6 @@ def blend_twin(entries, found, view, pixel):
     normal = np.float64(found.normal)[point] @ np.float64(view.cam_to_world)[:, :3]
     wide = (share @ x / divisor for x in (np.log(spacing), normal, np.float64(found.base_color)[point]))
     return min(opacity, 1), weight @ left, mean, spread, *wide
-
-
-class TestShares:
-    def lists(self, seed, high=3.0):
-        rng = np.random.default_rng(seed)
-        depth = np.sort(rng.uniform(2, 2 + high, (24, 60)), axis=0)
-        tau = rng.uniform(0, 3, (24, 60)) * (rng.uniform(size=(24, 60)) < 0.8)
-        return tuple(np.float32(x) for x in (tau, depth, rng.uniform(0.1, 0.6, (24, 60))))
-
-    def test_those_of_thin_layers_are_those_of_a_float64_loop(self):
-        dense, (tau, *others) = 0.005, self.lists(0, 6.0)
-        share, left = compute_blend_weights(*map(jnp.asarray, (dense * tau, *others)))
-        expected, behind = reference.shares(dense * tau, *others, blending.COMPARED)
-        close((share / dense, left), (expected / dense, behind), rtol=2e-5, atol=2e-6)
 
 
 class TestEntries:
