@@ -7,6 +7,7 @@ hold the answer.
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
@@ -135,14 +136,38 @@ def project(pose, intrinsics, positions):
 
 def project_twin(pose, intrinsics, positions):
     local = (positions - pose[:, 3]) @ pose[:, :3]
-    plane = local[:, :2] / -local[:, 2:] * [1, -1]
-    return intrinsics[0, 0] * plane + intrinsics[:2, 2], np.linalg.norm(local, axis=1)
+    ahead = local[:, 2:] < 0
+    plane = local[:, :2] / -np.where(ahead, local[:, 2:], 1) * [1, -1]
+    return np.where(ahead, intrinsics[0, 0] * plane + intrinsics[:2, 2], -np.inf), np.linalg.norm(local, axis=1)
 
 
 def before_eyes(rng, field):
     pose, intrinsics = views(rng, field)
     local = np.concatenate([rng.normal(size=(6, 5, 2)), -rng.uniform(2, 4, (6, 5, 1))], -1)
     return pose, intrinsics, np.einsum("nij,nkj->nki", pose[..., :3], local) + pose[:, None, :, 3]
+
+
+# before an eye, in its plane, behind it, and in the eye itself
+BESIDE_EYE = st.just(
+    (
+        np.eye(3, 4),
+        np.array([[7.0, 0, 3], [0, 7, 2], [0, 0, 1]]),
+        np.array([[0.5, 0.2, -2], [0.5, 0.2, 0], [0.5, 0.2, 2], [0, 0, 0]]),
+    )
+)
+
+
+def orbit_twin(azimuth, elevation, distance, centre):
+    """Azimuth from z towards x; beyond a pole the camera goes on upside down."""
+    right, south = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [np.sin(azimuth), 0, np.cos(azimuth)]])
+    backward = np.cos(elevation) * south + [0, np.sin(elevation), 0]
+    return np.stack([right, np.cross(backward, right), backward, centre + distance * backward], axis=-1)
+
+
+def around(rng):
+    """Azimuths, elevations with both poles among them, distances and centres."""
+    elevation = np.array([-0.5, 0.5, 1.5, *rng.uniform(-1, 1, 3)]) * np.pi
+    return rng.uniform(-4, 4, 6), elevation, rng.uniform(1, 4, 6), rng.normal(size=(6, 3))
 
 
 def box(origins, directions):
@@ -181,7 +206,8 @@ CAMERAS = (
     Law("camera_rays", view_rays, each(view_rays_twin, "(r,c),(k,k)->(h,w,r),(h,w,r)"),
         (Axis("field of view", 1e-20, 0.7, 3.1415, views),), (2, 2)),
     Law("project", project, each(project_twin, "(r,c),(k,k),(n,r)->(n,t),(n)"),
-        (Axis("field of view", 0.7, 0.7, 0.7, before_eyes),), (2, 2, 2), agreement=1e-7),
+        (Axis("field of view", 0.7, 0.7, 0.7, before_eyes),), (2, 2, 2), Extremes((BESIDE_EYE,)), agreement=1e-7),
+    Law("orbit", jax.vmap(cameras.orbit), each(orbit_twin, "(),(),(),(n)->(r,c)"), usual(around)),
     Law("intersect_box", box, each(box_twin, "(n),(n)->(),()"), sizes("distance of the camera", 1, 100, towards_box),
         (1, 1), Extremes((extremes(5, 3, low=-30, high=4), unit_vectors), floors=(FINITE, FINITE),
         check=touches_or_hits, twin=False)),
