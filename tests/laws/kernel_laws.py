@@ -87,6 +87,8 @@ NUMBERS = (
         Extremes((extremes(6, signed=False),))),
     Law("softplus", numerics.softplus, reference.softplus, usual(around_zero(6, 4)), (1,),
         Extremes((extremes(6, high=36),)), agreement=1e-8),
+    Law("slope of softplus", lambda x: jax.grad(lambda x: jnp.sum(numerics.softplus(x)))(x),
+        lambda x: 1 / (1 + np.exp(-x)), usual(around_zero(6, 4)), (1,)),
     Law("length", numerics.length, partial(np.linalg.norm, axis=-1), usual(around_zero(6, 3)), (1,),
         Extremes((vectors,))),
     Law("normalize", numerics.normalize, unit, usual(around_zero(6, 3)), (1,), Extremes((vectors,))),
