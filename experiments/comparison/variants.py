@@ -21,11 +21,11 @@ from experiments.comparison import figures, results_folder
 from experiments.comparison.contenders import of_network
 from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
+from experiments.comparison.view_scores import compare_high_frequencies
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets, images
-from spnr_jax.kernels import metrics
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring import evaluation
 from spnr_jax.scoring.picture_scores import Scores, differences, means, metric_settings, summarise
@@ -125,8 +125,7 @@ def study(
 
 def measure_detail(item: data_sets.ObjectData, pictures: evaluation.Pictures) -> Scores:
     """High-frequency energy over the reference's, by view."""
-    ratio = jax.jit(metrics.high_frequency_ratio)
-    return {"detail": np.asarray(ratio(np.asarray(pictures.image), data_sets.on_white(item.images)))}
+    return {"detail": compare_high_frequencies(np.asarray(pictures.image), data_sets.on_white(item.images))}
 
 
 def notes(found: Mapping) -> list[str]:

@@ -33,7 +33,7 @@ from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
-from spnr_jax.scoring.report import Cell, Table, duration, number, text
+from spnr_jax.scoring.report import Cell, Table, number, text
 
 METRICS = ("psnr", "ssim", "lpips", "flip", "cpsnr", "iou")
 COSTS = {"parameters": "Parameters", "steps": "Steps", "training_seconds": "Training", "ms_per_view": "ms per view"}
@@ -174,6 +174,14 @@ def _cost(cost: Mapping, column: str) -> Cell:
     if column == "training_seconds" and value is not None:
         return Cell(text=duration(value))
     return number(value, 1 if column == "ms_per_view" else 0, missing="-")
+
+
+def duration(seconds: float | int) -> str:
+    """Seconds in words: 8.4 s, 6 min 12 s, 2 h 5 min."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def notes(results: Mapping) -> list[str]:

@@ -13,7 +13,6 @@ from spnr_jax.kernels.numerics import check_alike, safe_divide
 
 PSNR_CAP = 100.0  # dB, of identical images
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # gaussian window of Wang et al. 2004, cut at 3.5 sigma as scikit-image does
-SILENT = 1e-10  # spectral energy per pixel below which there is only rounding; 8-bit steps have 5e-7
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
@@ -79,26 +78,3 @@ def opacity_iou(
     ours, theirs = acc > 0.5, alpha > 0.5
     union = jnp.sum(ours | theirs, axis=(-2, -1))
     return jnp.where(union > 0, safe_divide(1.0 * jnp.sum(ours & theirs, axis=(-2, -1)), 1.0 * union), 1.0)
-
-
-def high_frequency_ratio(
-    image: Float[Array, "*batch height width 3"], reference: Float[Array, "*batch height width 3"], share: float = 0.5
-) -> Float[Array, "*batch"]:
-    """Energy of the image over that of the reference above `share` of the Nyquist frequency; 1 is equally sharp.
-
-    Spectra of all channels in a Hann window; a constant does not count.  NaN where the reference has no such energy.
-    """
-    check_alike("high_frequency_ratio", image, reference)
-    height, width = image.shape[-3:-1]
-    rows, columns = (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n) for n in (height, width))
-    frequency = np.hypot(2 * np.fft.fftfreq(height)[:, None], 2 * np.fft.fftfreq(width))
-    window, high = rows[:, None] * columns, frequency >= share
-
-    def energy(x):
-        centred = x - jnp.mean(x, axis=(-3, -2), keepdims=True)
-        shape = (*[1] * (x.ndim - 3), height, width, 1)
-        spectrum = jnp.fft.fft2(centred * jnp.asarray(window.reshape(shape), x.dtype), axes=(-3, -2), norm="ortho")
-        return jnp.sum(jnp.where(high.reshape(shape), jnp.abs(spectrum) ** 2, 0), axis=(-3, -2, -1))
-
-    ours, theirs = energy(image), energy(reference)
-    return jnp.where(theirs > SILENT * height * width, safe_divide(ours, theirs), jnp.nan)

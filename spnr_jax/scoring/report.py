@@ -211,14 +211,6 @@ def flatten(settings: Mapping, prefix: str = "") -> dict[str, object]:
     return flat
 
 
-def duration(seconds: float | int) -> str:
-    """Seconds in words: 8.4 s, 6 min 12 s, 2 h 5 min."""
-    if seconds < 59.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
-
-
 def _shown(result: ObjectResult) -> dict[str, Pictures]:
     """Pictures of the gallery: all methods except the white image, networks first."""
     return {method: pictures for method, pictures in result.pictures.items() if method != "white"}

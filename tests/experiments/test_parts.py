@@ -10,9 +10,11 @@ from support.laws import close
 from support.surfel_clouds import camera, cloud
 
 from experiments.comparison import study_objects
+from experiments.comparison.view_scores import compare_high_frequencies
 from experiments.paper import fig3
 from experiments.paper.fig1 import Fig1, variant
 from experiments.paper.fig2 import nearest_views
+from experiments.paper.table1 import duration
 from experiments.studies import inverse, relighting
 from experiments.studies.speed_accuracy import front
 from spnr_jax import config, presets
@@ -101,3 +103,16 @@ def test_an_eye_sees_the_near_half_of_a_ball_and_nothing_behind_a_wall():
     found = fig3.visible_points(both - (0, 0, 3.0))
     assert len(found) == len(wall)
     assert (found < len(wall)).all()
+
+
+def test_durations_are_said_in_the_units_that_people_use():
+    spoken = {8.44: "8.4 s", 59.96: "1 min 0 s", 119.7: "2 min 0 s", 3599.9: "1 h 0 min", 7503: "2 h 5 min"}
+    assert {seconds: duration(seconds) for seconds in spoken} == spoken
+
+
+def test_high_frequencies_are_those_of_the_reference_or_there_is_no_ratio():
+    wave = np.sin(np.pi * 0.75 * np.arange(32))[:, None, None] * np.ones((32, 32, 3))
+    slow = np.cos(2 * np.pi * np.arange(32) / 32)[:, None, None] * np.ones((32, 32, 3))
+    found = compare_high_frequencies(np.stack([0.5 * wave + 0.2, wave, slow]), np.stack([wave, wave, wave]))
+    assert found == pytest.approx([0.25, 1, 0], abs=1e-6)
+    assert np.isnan(compare_high_frequencies(wave, np.full_like(wave, 0.3)))

@@ -256,17 +256,6 @@ def union_share(acc, alpha):
     return (ours & theirs).sum((-2, -1)) / (ours | theirs).sum((-2, -1))
 
 
-def sharpness_twin(image, other):
-    """The windowed spectrum beyond half of Nyquist, wave by wave."""
-    height, width = image.shape[:2]
-    window = np.outer(*(np.sin(np.pi * np.arange(n) / n) ** 2 for n in (height, width)))
-    rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) / (n / 2) for n in (height, width))
-    high = np.hypot(rows[:, None], columns) >= 0.5
-    spectra = (np.fft.fft2((x - x.mean((0, 1))) * window[..., None], axes=(0, 1)) for x in (image, other))
-    ours, theirs = (np.sum(np.abs(spectrum[high]) ** 2) for spectrum in spectra)
-    return ours / theirs
-
-
 def quality(image, other, mask):
     """All metrics; 0 where no pixel is visible."""
     visible = metrics.conditional_psnr(image, other, mask > 0.5)
@@ -313,8 +302,6 @@ LOSSES = (
         (3, 3), floors=(1.0,)),
     Law("opacity_iou", metrics.opacity_iou, union_share, usual(lambda rng: tuple(rng.uniform(size=(2, 6, 8, 8)))),
         (2, 2)),
-    Law("high_frequency_ratio", metrics.high_frequency_ratio, each(sharpness_twin, "(h,w,c),(h,w,c)->()"),
-        usual(lambda rng: tuple(rng.uniform(size=(2, 6, 16, 13, 3)))), (3, 3)),
     Law("metrics of pictures", quality, quality_twin,
         usual(lambda rng: (*(0.5 + 0.4 * rng.uniform(-1, 1, (2, 12, 12, 3))), np.eye(12))),
         extremes=Extremes((pictures(),), floors=(FINITE,) * 3, atol=lambda *x: 2e-3)),

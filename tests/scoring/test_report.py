@@ -14,7 +14,7 @@ from support import tiny_dataset, tiny_untrained
 from spnr_jax.scoring import report
 from spnr_jax.scoring.evaluation import ObjectResult, Pictures
 from spnr_jax.scoring.picture_scores import METRICS
-from spnr_jax.scoring.report import duration, write_report
+from spnr_jax.scoring.report import write_report
 
 VOID = {"meta", "img", "br"}
 SETTINGS = {"model": {"widths": (64, 128), "sampling": {"num_coarse": 16}}, "light": "<studio & sky>", "augment": {}}
@@ -142,11 +142,6 @@ def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     sure = {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}
     page = write(tmp_path, ours_minus={"splat": sure, "white": sure})
     assert "p < 0.001" in page.all("small")
-
-
-def test_durations_are_said_in_the_units_that_people_use():
-    spoken = {8.44: "8.4 s", 59.96: "1 min 0 s", 119.7: "2 min 0 s", 3599.9: "1 h 0 min", 7503: "2 h 5 min"}
-    assert {seconds: duration(seconds) for seconds in spoken} == spoken
 
 
 NUMBERS = {"objects", "views", "cpsnr_views", *METRICS, *(f"{metric}_interval" for metric in METRICS)}
