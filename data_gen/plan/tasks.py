@@ -57,7 +57,7 @@ class GenerateConfig:
     reshape_variants: bool = False
     """Also rotate, mirror and scale the variants, and change their roughness: more data from a few meshes."""
     train_objects: int | None = None
-    """Training objects, variants included: variants are drawn until there are as many (default: all variants)."""
+    """Most training objects, variants included: variants are drawn until there are as many (default: all variants)."""
     test_objects: int | None = None
     """Objects of the test split, drawn by the seed (default: the share --test-fraction)."""
     test_list: Path | None = None
@@ -173,6 +173,10 @@ def check_options(config: GenerateConfig) -> None:
     if unknown := set(config.categories) - set(procedural.CATEGORIES):
         known = ", ".join(procedural.CATEGORIES)
         raise UserError(f"--categories: no category {', '.join(sorted(unknown))}; there are {known}")
+    if config.reshape_variants and not config.colour_variants:
+        raise UserError("--reshape-variants: give --colour-variants, the number of variants of each object")
+    if config.categories and (config.objects == 0 or (config.objects is None and (config.meshes or config.root))):
+        raise UserError("--categories: of procedural objects; give --objects, their number")
     if config.meshes and config.preset:
         raise UserError(f"--meshes {config.meshes}: not together with --preset {config.preset}; give one of them")
     if config.root and not config.preset:

@@ -1,9 +1,11 @@
 """The methods of a comparison: trained networks and trivial renderers."""
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 import experiments.baselines  # noqa: F401 - registers them
@@ -80,6 +82,12 @@ def of_runs(runs: tuple[str, ...]) -> dict[str, tuple[Model, Quality]]:
         if method_of(model.config).takes_light:
             found[f"{run}, discs and light alone"] = (model, "draft")
     return found
+
+
+def checksums(runs: tuple[str, ...]) -> dict[str, str]:
+    """SHA-256 of each run's weights: a run that was trained further is another network."""
+    arrays = {run: map(np.asarray, jax.tree.leaves(weights.load(run).params)) for run in runs}
+    return {run: hashlib.sha256(b"".join(x.tobytes() for x in leaves)).hexdigest() for run, leaves in arrays.items()}
 
 
 def trivial_ones(names: tuple[str, ...], dataset: Dataset, config: TrainConfig) -> dict[str, Method]:

@@ -7,7 +7,6 @@
 Intermediate results have files of their own, so that the same command continues where it was stopped.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from spnr_jax.scoring.report import Cell, Table
 
 def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | None = None) -> None:
     """Records a request (on a data set) in its folder; ValueError if the folder belongs to another one."""
-    asked = {"of": what, **asked} | ({} if dataset is None else {"data": checksum(dataset)})
+    asked = {"of": what, **asked} | ({} if dataset is None else {"data": data_sets.checksum(dataset, *dataset.splits)})
     path = folder / "asked.json"
     if path.is_file():
         there = json.loads(path.read_text())
@@ -33,12 +32,6 @@ def claim(folder: Path, what: str, asked: Mapping, dataset: data_sets.Dataset | 
             raise UserError(f"{folder} holds {found}; choose another --out")
     else:
         images.write_whole(path, as_json(asked))
-
-
-def checksum(dataset: data_sets.Dataset) -> str:
-    """A checksum of a data set's settings and object names."""
-    content = json.dumps([dataset.settings, dataset.splits], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def as_json(content: object) -> bytes:

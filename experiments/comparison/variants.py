@@ -68,7 +68,7 @@ class Budget:
 
     def names(self, dataset: data_sets.Dataset) -> tuple[str, ...]:
         """The objects to be scored."""
-        return test_objects(dataset, QUICK_OBJECTS if self.quick else self.objects)
+        return test_objects(dataset, QUICK_OBJECTS if self.quick else self.objects, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +195,7 @@ def conditions(dataset: data_sets.Dataset, names: tuple[str, ...], config: Train
         "hardware": runtime.describe_hardware(),
         "data": dataset.settings.get("settings", {}) | counts,
         "test_objects": list(names),
-        "points": config.test_points,
+        "points": min(config.test_points, len(data_sets.read_object(dataset, names[0]).cloud.mask)),
         "resolution": config.model.image_resolution,
         "metrics": metric_settings(),
     }

@@ -25,7 +25,7 @@ from scipy.spatial import ConvexHull
 
 from experiments import entry_point
 from experiments.comparison import results_folder, scores
-from experiments.comparison.contenders import Method, of_model
+from experiments.comparison.contenders import Method, checksums, of_model
 from experiments.comparison.scores import OPAQUE, Measured
 from experiments.comparison.study_objects import cut, each_view, test_objects
 from experiments.comparison.view_scores import mean
@@ -77,9 +77,9 @@ class Fig3:
 def main(options: Fig3) -> None:
     """Makes what is missing of the scores, then table and picture."""
     dataset = data_sets.open_dataset(options.data)
-    names = test_objects(dataset, 2 if options.quick else options.objects)
+    names = test_objects(dataset, 2 if options.quick else options.objects, options.points)
     found = all_methods(options.runs)
-    asked = {"runs": list(found), "points": options.points, "objects": names}
+    asked = {"runs": checksums(options.runs), "points": options.points, "objects": names}
     results_folder.claim(options.out, "depths", asked, dataset)
     rows = {name: partial(measure, options.points, method) for name, method in found.items()}
     shown = evaluation.pick_evenly(names, options.shown)

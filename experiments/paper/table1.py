@@ -84,7 +84,7 @@ class Table1:
 def main(options: Table1) -> None:
     """Trains what is not trained, scores all methods, writes tables and pictures."""
     dataset = data_sets.open_dataset(options.data)
-    names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None))
+    names = test_objects(dataset, options.objects or (QUICK_OBJECTS if options.budget == "quick" else None), 1)
     first = data_sets.read_object(dataset, names[0])
     category = dataset.settings.get("settings", {}).get("category")
     configs = make_configs(options, first.camera.height, category)

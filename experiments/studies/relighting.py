@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments import entry_point
 from experiments.comparison import figures, results_folder, scores
-from experiments.comparison.contenders import draw_volume
+from experiments.comparison.contenders import checksums, draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax.config import Quality
@@ -69,14 +69,14 @@ class RelightingStudy:
 
 def main(options: RelightingStudy) -> None:
     """Draws, scores and writes."""
-    model = load(options.run)
+    model, run = load(options.run), checksums((options.run,))
     found: Found = {}
     columns: dict[str, list[np.ndarray]] = {}
     for folder in options.data:
         dataset = data_sets.open_dataset(folder)
         check_known_light(model.config, dataset)
-        names, light = test_objects(dataset, options.objects), name_of(dataset)
-        asked = {"run": options.run, "views": options.views, "objects": names, "resolution": options.resolution}
+        names, light = test_objects(dataset, options.objects, max(options.counts)), name_of(dataset)
+        asked = {"run": run, "views": options.views, "objects": names, "resolution": options.resolution}
         results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)
         rows = {f"{light}/{count:,} points": partial(measure, options, model, count) for count in options.counts}
         measured = scores.measure_rows(options.out, rows, dataset, names, names[:GALLERY])

@@ -84,8 +84,9 @@ class SharpnessStudy:
 def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
-    names = test_objects(dataset, options.objects)
-    asked = {name: getattr(options, name) for name in ("runs", "counts", "views", "resolution", "normals")}
+    names = test_objects(dataset, options.objects, max(options.counts))
+    asked = {name: getattr(options, name) for name in ("counts", "views", "resolution", "normals")}
+    asked |= {"runs": contenders.checksums(options.runs)}
     results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
     models = contenders.of_runs(options.runs)
     for model, _ in models.values():

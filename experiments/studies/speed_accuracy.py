@@ -31,7 +31,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from experiments import entry_point
 from experiments.comparison import results_folder, scores
-from experiments.comparison.contenders import draw_volume
+from experiments.comparison.contenders import checksums, draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax.config import NetworkConfig, Quality
@@ -195,8 +195,8 @@ class Row(NamedTuple):
 def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the tables and the plot."""
     dataset = data_sets.open_dataset(options.data)
-    names = test_objects(dataset, options.objects)
-    asked = {"objects": names, "views": options.views, "runs": options.runs}
+    names = test_objects(dataset, options.objects, max(options.counts))
+    asked = {"objects": names, "views": options.views, "runs": checksums(options.runs)}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
     rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]
     telling = sorted(rows, key=lambda row: row.setting.group != "level")  # the most telling ones first

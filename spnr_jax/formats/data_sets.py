@@ -1,5 +1,6 @@
 """Reads the data sets that `spnr-data generate` writes, as NumPy arrays; docs/data.md describes their files."""
 
+import hashlib
 import io
 import json
 from dataclasses import dataclass
@@ -89,6 +90,15 @@ def open_dataset(folder: Path | str) -> Dataset:
         if strange := [name for name in splits[split] if not is_plain_name(name)]:
             raise UserError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
     return Dataset(folder=folder, settings=settings, splits=splits)
+
+
+def checksum(dataset: Dataset, *splits: str) -> str:
+    """SHA-256 of the settings and of splits: the names of their objects, and the checksums of these objects' files."""
+    found = hashlib.sha256(json.dumps(dataset.settings, sort_keys=True).encode())
+    for name in (name for split in splits for name in (split, *dataset.splits[split])):
+        record = dataset.folder / "objects" / name / "object.json"
+        found.update(name.encode() + b"\n" + (record.read_bytes() if record.is_file() else b""))
+    return found.hexdigest()
 
 
 def is_plain_name(name: str) -> bool:

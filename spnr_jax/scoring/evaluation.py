@@ -261,7 +261,7 @@ def compare(
         )
     for one in trained.values():
         check_known_light(one.config.model, dataset)
-    check_scorable(data_sets.read_object(dataset, names[0]), config)
+    check_scorable(item := data_sets.read_object(dataset, names[0]), config)
     say("choosing the radius of the points for the trivial methods")
     factors = {method: choose_radius(dataset, config, method) for method in ("splat", "nearest")}
     methods = {name: make_method(one.variables, one.config) for name, one in trained.items()}
@@ -277,7 +277,7 @@ def compare(
         "settings": {
             "split": split,
             "networks": {name: {"preset": one.config.preset, "steps": one.steps} for name, one in trained.items()},
-            "points": config.test_points,
+            "points": len(_thin(item, config).cloud.mask),
             "radius factors": factors,
             "metrics": metric_settings(),
         },

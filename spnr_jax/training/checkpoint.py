@@ -1,14 +1,13 @@
 """Run folders on disk: the config, and checkpoints of the training state through Orbax.
 
     RUN/config.json          the TrainConfig
-    RUN/data.txt             a checksum of the data set's settings and training objects
+    RUN/data.txt             a checksum of the data set's settings and training objects, files included
     RUN/checkpoints/STEP/    one state; appears complete or not at all
     RUN/training.lock        empty; locked while a process trains there
 
 The newest readable checkpoint counts: if one is damaged, a message names it and the previous one is used.
 """
 
-import hashlib
 import json
 import logging
 import os
@@ -23,6 +22,7 @@ from flax.traverse_util import flatten_dict
 from spnr_jax.config import TrainConfig
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError, first_line
+from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import Dataset
 from spnr_jax.formats.images import check_place, write_whole
 from spnr_jax.methods import UnknownMethod, from_dict, to_dict
@@ -66,8 +66,8 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def record_data(run: Path, dataset: Dataset) -> bool:
     """Writes the data set's checksum to the run folder; False if its checkpoints began with another data set."""
-    path, described = run / "data.txt", json.dumps([dataset.settings, dataset.splits["train"]]).encode()
-    known, checksum = path.read_text() if path.is_file() else None, hashlib.sha256(described).hexdigest()
+    path, checksum = run / "data.txt", data_sets.checksum(dataset, "train")
+    known = path.read_text() if path.is_file() else None
     if known != checksum:
         write_whole(path, checksum.encode())
     return known in (None, checksum) or not (run / "checkpoints").is_dir()

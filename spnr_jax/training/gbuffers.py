@@ -32,7 +32,7 @@ from spnr_jax.devices import programs
 from spnr_jax.errors import UserError
 from spnr_jax.formats.array_files import pack_arrays, read_arrays
 from spnr_jax.formats.clouds import MOST_EVEN
-from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object
+from spnr_jax.formats.data_sets import Dataset, ObjectData, checksum, read_object
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.cleaning import Cleaned, clean_columns
@@ -151,7 +151,7 @@ def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict)
     names = "seed", "min_points", "max_points", "even_share", "views_per_object"
     chosen = [getattr(config, x) for x in names]
     numbers = dataclasses.astuple(CONSTANTS), list(shader.INPUTS.items()), list(shader.MAPS.items())
-    made_of = hashlib.sha256(json.dumps([chosen, dataset.settings, numbers]).encode())
+    made_of = hashlib.sha256(json.dumps([chosen, checksum(dataset, "train"), numbers]).encode())
     for leaf in jax.tree.leaves((light, variables)):
         made_of.update(np.asarray(leaf).tobytes())
     return np.frombuffer(made_of.digest(), np.uint8)

@@ -150,7 +150,7 @@ RUNS = {  # name -> its options, the pictures that it writes, and what is known 
         check_speed_accuracy,
     ),
     "paper.fig3": (
-        lambda data: {"data": data.painted, "runs": (), "quick": True},
+        lambda data: {"data": data.painted, "runs": (), "points": 32, "quick": True},
         ("fig3_depth.png",),
         check_fig3,
     ),

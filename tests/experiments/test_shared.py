@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support import tiny_dataset
 
-from experiments.comparison import results_folder, scores, study_objects
+from experiments.comparison import contenders, results_folder, scores, study_objects
 from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
@@ -93,6 +93,17 @@ def test_what_cannot_be_compared_is_refused_by_name(monkeypatch):
         fig3.all_methods(("npbg",))
     dataset = tiny_dataset.dataset()
     with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
-        study_objects.test_objects(dataset, 0)
+        study_objects.test_objects(dataset, 0, 1)
     with pytest.raises(ValueError, match="the test split is empty"):
-        study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None)
+        study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None, 1)
+    with pytest.raises(ValueError, match=r"4,097 points of an object .* are there; .* generate it with --points 4097"):
+        study_objects.test_objects(dataset, None, 4097)
+
+
+def test_a_run_that_was_trained_further_is_another_network(monkeypatch):
+    params = {"a": np.zeros(3), "b": np.ones(2)}
+    monkeypatch.setattr(weights, "load", lambda run: SimpleNamespace(params=params))
+    before = contenders.checksums(("one", "two"))
+    assert before["one"] == before["two"]
+    params["a"][1] = 1e-9
+    assert contenders.checksums(("one",))["one"] != before["one"]

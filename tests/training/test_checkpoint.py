@@ -117,9 +117,14 @@ def test_a_config_that_is_none_is_an_error_with_its_path(text, tmp_path):
         checkpoint.read_config(tmp_path)
 
 
-def test_a_run_with_a_checkpoint_tells_another_data_set_once(run):
+@pytest.mark.parametrize("changed", ["list", "files"])
+def test_a_run_with_a_checkpoint_tells_another_data_set_once(changed, run, tmp_path):
     one = tiny_dataset.dataset()
     other = dataclasses.replace(one, splits=one.splits | {"train": one.splits["train"][1:]})
+    if changed == "files":  # of one object
+        shutil.copytree(one.folder, tmp_path / "other")
+        other = dataclasses.replace(one, folder=tmp_path / "other")
+        (tmp_path / "other" / "objects" / one.splits["train"][0] / "object.json").write_text("{}")
     assert [checkpoint.record_data(run, dataset) for dataset in (one, one, other, other)] == [True, True, False, True]
     shutil.rmtree(run / "checkpoints")
     assert checkpoint.record_data(run, one)

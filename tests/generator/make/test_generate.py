@@ -119,6 +119,8 @@ def test_an_unexpected_error_leaves_out_that_object_only_but_a_full_disk_stops_t
         (["--meshes", "absent"], "absent is not a folder"),
         (["--views", "0"], "--views: expected 1 or more, got 0"),
         (["--categories", "spaceship"], "no category spaceship; there are chair"),
+        (["--categories", "chair", "--objects", "0"], "--categories: of procedural objects; give --objects"),
+        (["--reshape-variants"], "--reshape-variants: give --colour-variants"),
         (["--distance", "0.5"], "--distance: expected more than 1"),
         (["--test-fraction", "1"], "leave some objects"),
         (["--objects", "0"], "nothing to do"),
