@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support.laws import close
+from support.surfel_clouds import cloud
 
 from spnr_jax.kernels.cloud_arrays import farthest_points, pad
 from spnr_jax.surfels import symmetry
 from spnr_jax.surfels.neighbors import measure_evenness, neighbors
-from tests.support.laws import close
-from tests.support.surfel_clouds import cloud
 
 DEEP = 0.35  # half the depth of the seat
 BACK = np.array([0.0, 0.35, -DEEP + 0.05])
