@@ -70,7 +70,7 @@ def lights():
 
 def projection(scene, found: Rendering):
     """A number that image, opacity and depth take part in."""
-    return jnp.sum(found.image**2) + jnp.sum(found.acc) + 1e-3 * jnp.sum(found.depth * scene.scale)
+    return jnp.sum(found.image**2) + jnp.sum(found.acc) + 0.1 * jnp.sum(found.depth * scene.scale)
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def test_gradients_are_central_differences_of_float64(params, scenes, views, lig
                 slopes[jax.tree_util.keystr(place)] = np.vdot(gradient, way), float(ends[0] - ends[1]) / 2e-6
     assert sum(abs(difference) > 1e-2 for _, difference in slopes.values()) >= 16
     for place, pair in slopes.items():
-        np.testing.assert_allclose(*pair, rtol=1e-2, err_msg=place)
+        np.testing.assert_allclose(*pair, rtol=3e-3, err_msg=place)
 
 
 LINE = np.linspace(-0.6, 0.6, 40)[:, None] * np.array([[0.6, 0.0, 0.8]])
