@@ -135,4 +135,4 @@ def _from_there(positions: np.ndarray, place: np.ndarray, share: float, within: 
     """Whether that share of the points is visible from a position; `within`: the answer inside their bounding box."""
     if np.all((place > positions.min(axis=0)) & (place < positions.max(axis=0))):
         return within
-    return bool(find_visible(positions, place, measure_spacing(positions), BEHIND).mean() > share)
+    return bool(find_visible(positions, place, measure_spacing(cKDTree(positions)), BEHIND).mean() > share)

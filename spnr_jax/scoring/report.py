@@ -112,12 +112,6 @@ def label(method: str) -> str:
     return OTHERS.get(method) or label_of(method)
 
 
-def lower_first(method: str) -> str:
-    """A method's name inside a sentence."""
-    name = label(method)
-    return name if name[:2].isupper() else name[:1].lower() + name[1:]
-
-
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}
 GALLERY_NOTE = (
     "The number below a picture is its PSNR in dB. Depth: bright is near, dark is far, spanning each picture's own "
@@ -244,7 +238,7 @@ def _difference_table(first: str, minus: Mapping[str, Mapping]) -> Table:
     """Other methods against the difference in each metric."""
     names = [name for name in QUALITY if any(name in row for row in minus.values())]
     rows = tuple(
-        (f"{label(first)} minus {lower_first(method)}", tuple(difference(row.get(m), m) for m in names))
+        (f"{label(first)} minus {label(method)}", tuple(difference(row.get(m), m) for m in names))
         for method, row in minus.items()
     )
     return Table(title="Differences", note=DIFFERENCES_NOTE, heads=tuple(map(head, names)), rows=rows)

@@ -41,7 +41,7 @@ def estimate_normals(
     previous plane, so that a point at an edge gets one of its faces (robust moving least squares, Fleishman et al.
     2005). `noise` is the standard deviation of the points before they were averaged: it enlarges the neighbourhood.
     """
-    spacing = _measure_spacing(tree)
+    spacing = measure_spacing(tree)
     radius, thick = REACH * max(noise, spacing), max(THICK[0] * spacing, THICK[1] * noise)
     count = DISCS * np.pi * (radius / spacing) ** 2 if spacing > 0 else MOST
     ranks = list(range(1, round(min(count, MOST, tree.n)) + 1))
@@ -114,12 +114,8 @@ def find_visible(
     return visibility
 
 
-def measure_spacing(positions: Float[np.ndarray, "points 3"]) -> float:
+def measure_spacing(tree: cKDTree) -> float:
     """Median side of the square that a point represents, from 16 neighbours; 0 for fewer than two points."""
-    return _measure_spacing(cKDTree(positions))
-
-
-def _measure_spacing(tree: cKDTree) -> float:
     return 0.0 if tree.n < 2 else cloud_arrays.measure_spacing(tree, min(NEIGHBORS, tree.n), SAMPLE)
 
 

@@ -19,10 +19,10 @@ from spnr_jax.method.model import DISTANCE, Model
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.surfels import gaussians
 from spnr_jax.surfels.gaussians import View
+from spnr_jax.surfels.sides import spiral
 
 HIT = 0.5  # opacity from which a pixel has a depth
 VIEWS, RESOLUTION = 32, 512  # pictures, and their pixels along each side
-GOLDEN_ANGLE = 180 * (3 - np.sqrt(5))  # degrees between the azimuths of one direction and the next
 
 
 def surface_depth(rendering: Rendering, camera: Camera, volume: Encoded) -> np.ndarray:
@@ -44,8 +44,8 @@ def _far(
 
 def draw_around(model: Model, volume: Encoded, light: Light | None, count: int, resolution: int) -> list[View]:
     """The network's pictures from even directions, from the top down along a spiral; the cameras are in the box."""
-    heights = 1 - (2 * np.arange(count) + 1) / count
-    angles = zip(np.arange(count) * GOLDEN_ANGLE % 360, np.degrees(np.arcsin(heights)), strict=True)
+    x, y, z = spiral(count).T
+    angles = zip(np.degrees(np.arctan2(z, x)), np.degrees(np.arcsin(y)), strict=True)
     viewpoints = [model.camera(volume, float(azimuth), float(height), resolution) for azimuth, height in angles]
     found, centre, scale = [], np.asarray(volume.centre), np.asarray(volume.scale)
     for camera, drawn in zip(viewpoints, model.render_each(volume, viewpoints, lights=[light] * count), strict=True):

@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from spnr_jax.surfels.normals import find_visible, measure_spacing
 
@@ -41,7 +42,7 @@ def add_outliers(positions, values, rng, *, share: float) -> Points:
 
 def simulate_scanners(positions, values, rng, *, scanners: int) -> Points:
     """The points that scanners in random directions see."""
-    spacing, visible = measure_spacing(positions), np.zeros(len(positions), bool)
+    spacing, visible = measure_spacing(cKDTree(positions)), np.zeros(len(positions), bool)
     for direction in rng.normal(size=(scanners, 3)):
         visible |= find_visible(positions, SCANNER * direction / np.linalg.norm(direction), spacing, BEHIND)
     return positions[visible], {name: column[visible] for name, column in values.items()}

@@ -136,7 +136,7 @@ def test_the_best_value_of_each_metric_alone_is_bold_and_what_is_missing_is_not_
 
 def test_differences_have_a_sign_an_interval_and_a_test(tmp_path):
     page = write(tmp_path)
-    assert {"Ours minus base-colour splat", "Ours minus white image"} <= set(page.all("th"))
+    assert {"Ours minus Base-colour splat", "Ours minus White image"} <= set(page.all("th"))
     assert page.all("td").count("+3.12") == 2
     assert {"[-0.50, +6.75]", "p = 0.012"} <= set(page.all("small"))
     sure = {"psnr": {"mean": 3.0, "interval": [2.0, 4.0], "p_value": 0.0001}}

@@ -35,18 +35,18 @@ def test_points_that_span_no_plane_have_some_normal_of_unit_length(count, size):
 
 def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_points():
     points, place = spiral(5000), np.array([0, 3.0, 0])
-    spacing = measure_spacing(points)
+    spacing = measure_spacing(cKDTree(points))
     np.testing.assert_allclose(spacing, np.sqrt(4 * np.pi / 5000), rtol=0.1)
     seen, height = find_visible(points, place, spacing, 4), points[:, 1]
     assert seen[height > 0.5].all()
     assert not seen[height < 0].any()
     assert not find_visible(np.ones((5, 3)), np.ones(3), 0.1, 2.0).any()
-    assert measure_spacing(np.zeros((1, 3))) == 0
+    assert measure_spacing(cKDTree(np.zeros((1, 3)))) == 0
 
 
 def test_noise_tilts_normals_less_because_more_points_are_asked():
     points = spiral(8000)
-    noise = 0.4 * measure_spacing(points)
+    noise = 0.4 * measure_spacing(cKDTree(points))
     noisy = points + np.random.default_rng(0).normal(size=points.shape) * noise
     told, untold = (
         1 - np.abs(np.sum(estimate_normals(noisy, cKDTree(noisy), sigma) * points, axis=1))
