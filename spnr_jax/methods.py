@@ -45,10 +45,9 @@ class Method:
 
     config: type[NetworkConfig]
     """The config class of the network; its `method` is the name of the method."""
-    network: str | Function | None = None
+    network: Function | None = None
     """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud,
-    camera, key, train)`; or its location as "package.module:Name".  Values that it sows into "losses" are added to the
-    loss."""
+    camera, key, train)`.  Values that it sows into "losses" are added to the loss."""
     init: Function = lazy("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""
     encode: Function = lazy("spnr_jax.method.inference:encode_object")
@@ -101,7 +100,7 @@ METHODS: dict[str, Method] = {
     ),
     "paper": Method(
         config=PaperConfig,
-        network="spnr_jax.method.paper_method:PaperNetwork",
+        network=lazy("spnr_jax.method.paper_method:PaperNetwork"),
         encode=lazy("spnr_jax.method.paper_method:encode_object"),
         render=lazy("spnr_jax.method.paper_method:render_each"),
         discriminator=lazy("spnr_jax.method.paper_method:discriminator"),
@@ -181,7 +180,7 @@ def network(config: NetworkConfig) -> Any:
     """The Linen module for a network's config; its code is imported at the first call."""
     found = method_of(config).network
     assert found is not None, f"{config.method} is no Linen module"
-    return (lazy(found) if isinstance(found, str) else found)(config)
+    return found(config)
 
 
 def method_of(config: NetworkConfig) -> Method:

@@ -27,8 +27,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import viser
 import websockets.asyncio.server
-from websockets.datastructures import Headers
-from websockets.http11 import Request, Response
+from websockets.http11 import Request
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats import clouds, images
@@ -50,14 +49,14 @@ Shown = TypeVar("Shown")
 RequestHook = Callable[[Any, Request], Any]
 
 
-def check_request(request: Request, token: str, reached_at: str | None = None) -> Request | Response:
-    """The request with the path after the token, or a refusal."""
+def check_request(request: Request, token: str, reached_at: str | None = None) -> Request | str:
+    """The request with the path after the token, or why it is refused."""
     first, _, rest = request.path.removeprefix("/").partition("/")
     if not hmac.compare_digest(first.partition("?")[0].encode(), token.encode()):
-        return _refusal(CLOSED)
+        return CLOSED
     origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
     if not all(_is_own(origin, hosts, reached_at) for origin in origins):
-        return _refusal(FOREIGN)
+        return FOREIGN
     return dataclasses.replace(request, path="/" + rest)
 
 
@@ -68,12 +67,6 @@ def _is_own(origin: str, hosts: list[str], reached_at: str | None) -> bool:
         return False
     known = (reached_at or "").lower().removesuffix(DEFAULT_PORTS[scheme])
     return [address] == [host.lower() for host in hosts] or (known != "" and address == known)
-
-
-def _refusal(why: str) -> Response:
-    content = why.encode()
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(content))})
-    return Response(HTTPStatus.FORBIDDEN, HTTPStatus.FORBIDDEN.phrase, headers, content)
 
 
 @contextlib.contextmanager
@@ -88,9 +81,9 @@ def require_token(token: str, reached_at: str | None = None) -> Iterator[list[An
     def serve(*arguments: Any, process_request: RequestHook | None = None, **options: Any) -> Any:
         def ask(connection: Any, request: Request) -> Any:
             answer = check_request(request, token, reached_at)
-            if isinstance(answer, Response) or process_request is None:
-                return answer if isinstance(answer, Response) else None
-            return process_request(connection, answer)
+            if isinstance(answer, str):
+                return connection.respond(HTTPStatus.FORBIDDEN, answer)
+            return process_request and process_request(connection, answer)
 
         opened.append(original(*arguments, process_request=ask, **options))
         return opened[-1]
