@@ -116,7 +116,7 @@ REFUSED = [  # command, what its line says
     ("share ball.xyz --out page.pdf", "page.pdf"),
     ("share ball.xyz --background light", "--background"),
     ("share ball.xyz --fitting-views 1", "--fitting-views"),
-    *((f"view a.ply --reached-at {place}", "--reached-at") for place in ("http://a.b", "''", "u@a")),
+    *((f"view a.ply --reached-at {place}", "--reached-at") for place in ("http://a.b", "''", "u@a", "a.b:99999")),
 ]
 
 

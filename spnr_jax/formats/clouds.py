@@ -179,7 +179,7 @@ def _place(path: Path, kind: str, points: Points, noise: float, how: Reading) ->
         values["normals"] = values["normals"] @ rotation.T
     origin = _find_origin(positions + before)
     if origin.any():
-        how.report(f"moved by {' '.join(f'{0 - value:.0f}' for value in origin)} to keep precision")
+        how.report(f"moved by {' '.join(f'{0 - value:.15g}' for value in origin)} to keep precision")
     cloud = _float32((positions + (before - origin)) @ rotation.T, values)
     return PlacedCloud(cloud=cloud, up=up, rotation=rotation, origin=origin)
 
@@ -206,10 +206,17 @@ def _float32(positions: np.ndarray, values: dict[str, np.ndarray]) -> PointCloud
 
 
 def _find_origin(positions: np.ndarray) -> np.ndarray:
-    """Whole numbers (3,) to subtract from positions (n, 3) if float32 is too coarse for them, else 0."""
+    """Round numbers (3,) to subtract from positions (n, 3) if float32 is too coarse for them, else 0.
+
+    They are whole for clouds of one unit and more, else multiples of the power of ten below the extent.
+    """
     low, high = inner_box(positions)
     step = np.spacing(np.float32(np.maximum(np.abs(low), np.abs(high)).max()))
-    return np.floor(low) if step > COARSEST_STEP * (high - low).max() > 0 else np.zeros(3)
+    extent = (high - low).max()
+    if not step > COARSEST_STEP * extent > 0:
+        return np.zeros(3)
+    finer = 10.0 ** max(0, -np.floor(np.log10(extent)))
+    return np.floor(low * finer) / finer
 
 
 def _mesh_columns(path: Path, kind: str, how: Reading) -> tuple[Columns, bool]:

@@ -55,7 +55,9 @@ def write_splats(path: str | Path, gaussians: Gaussians, note: str = "") -> int:
 def check_suffix(path: Path) -> None:
     """ValueError unless the path has a suffix of splats and can be written."""
     if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"{path}: splats are written as {' or '.join(SUFFIXES)}, not {path.suffix or 'a folder'}")
+        raise UserError(
+            f"{path}: splats are written as {' or '.join(SUFFIXES)}, not {path.suffix or 'without a suffix'}"
+        )
     check_place(path)
 
 
@@ -91,8 +93,18 @@ def ply_of(gaussians: Gaussians, note: str = "") -> bytes:
     return ("\n".join(header) + "\n").encode("ascii", "replace") + rows.tobytes()
 
 
+def fits_spz(gaussians: Gaussians) -> bool:
+    """Whether a .spz file can hold the positions, and the widths of most splats: 0.00005 to 380 units."""
+    widths = np.log(np.asarray(gaussians.scale, np.float64).max(axis=1))
+    held = 0 < np.median(widths) - LEAST_SCALE < 255 / SCALE_STEP
+    return bool(held and np.abs(gaussians.position).max() < 2**23)
+
+
 def spz_of(gaussians: Gaussians) -> bytes:
-    """The splats as a .spz file."""
+    """The splats as a .spz file; ValueError if it cannot hold ones of this size."""
+    if not fits_spz(gaussians):
+        width = float(np.median(np.asarray(gaussians.scale).max(axis=1)))
+        raise UserError(f"a .spz file holds no splats {width:.2g} units wide: write a .ply, or choose another unit")
     names = "position", "scale", "rotation", "opacity", "harmonics"
     position, scale, rotation, opacity, harmonics = (np.asarray(getattr(gaussians, x), np.float64) for x in names)
     bits = int(np.clip(FRACTION_BITS - np.ceil(np.log2(max(np.abs(position).max(), 1e-6))), 0, 31))

@@ -10,7 +10,7 @@ import base64
 import contextlib
 import io
 import os
-import warnings
+import subprocess
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -32,6 +32,8 @@ OPAQUE = 0.5  # opacity from which a pixel's depth counts in the range of the co
 PALETTE_PIXELS = 128  # least side of the frames from which the palette is chosen
 PALETTE_FRAMES = 24  # frames, spread over the film, from which a GIF's palette is chosen
 CENTISECOND = 0.01  # time unit of a GIF
+ROUNDED = 0.05  # share by which that may change the rate of frames without a word
+QUALITY = 10  # of an .mp4: constant rate factor, from 0 (the best) to 51
 # viridis (Smith, van der Walt 2015) at 20 even steps, dark to bright; interpolation is off by at most 4 / 255
 VIRIDIS = (
     "440154 481467 482576 453781 404688 39558c 33638d 2d718e 287d8e 238a8d "
@@ -124,10 +126,12 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
         try:
             _write_mp4(path, pictures, fps)
             return path, ""
-        except (ImportError, RuntimeError):  # the latter on platforms for which the package has no ffmpeg
+        except (ImportError, RuntimeError):  # no package, or no ffmpeg in it for this platform
             reason = "written as .gif: .mp4 needs ffmpeg (pip install imageio-ffmpeg)"
-    path = path.with_suffix(".gif")
+    path, shown = path.with_suffix(".gif"), 1 / (round(1 / (fps * CENTISECOND)) * CENTISECOND)
     write_whole(path, _gif(pictures, fps))
+    if abs(shown - fps) > ROUNDED * fps:
+        reason += f"{'; ' * bool(reason)}{shown:.3g} frames a second, as a .gif counts hundredths of a second"
     return path, reason
 
 
@@ -155,16 +159,15 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
     import imageio_ffmpeg
 
     height, width = (size - size % 2 for size in pictures[0].shape[:2])
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY), "-v", "error", "-y"]
+    frames = b"".join(np.ascontiguousarray(picture[:height, :width]).tobytes() for picture in pictures)
     with _in_its_place(path) as unfinished:
-        writer = imageio_ffmpeg.write_frames(
-            str(unfinished), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
-        )
-        with warnings.catch_warnings():  # JAX's warning: the child process executes ffmpeg at once
-            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-            writer.send(None)
-        for picture in pictures:
-            writer.send(np.ascontiguousarray(picture[:height, :width]))
-        writer.close()
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), *given, *wanted, str(unfinished)]
+        done = subprocess.run(command, input=frames, capture_output=True)
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"]
+            raise UserError(f"{path}: ffmpeg could not write it ({said[-1]})")
 
 
 def template(path: Path) -> Template:
@@ -188,8 +191,8 @@ def read_light(source: Path | str, normalise: bool = True) -> Light:
 def read_envmap(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Linear radiance of a latitude-longitude map; ValueError names the file and what is wrong."""
     if not path.is_file():
-        known = ", ".join(NAMES)
-        raise UserError(f"{path}: no such file; give a latitude-longitude .hdr or .exr, or one of {known}")
+        known, found = ", ".join(NAMES), "no file" if path.exists() else "no such file"
+        raise UserError(f"{path}: {found}; give a latitude-longitude .hdr or .exr, or one of {known}")
     if path.suffix.lower() not in ENDINGS:
         raise UserError(f"{path}: no map of radiance, which is .hdr or .exr; 8-bit pictures have no bright lamps")
     if path.stat().st_size > MOST_BYTES:

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.cloud_arrays import find_extent, first_in_voxels, voxel_keys
+from spnr_jax.kernels.cloud_arrays import find_extent, first_in_voxels
 
 Box = Sequence[float | int]
 
@@ -118,9 +118,9 @@ def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None 
 
     Ties in size are broken by the order of the clusters' first points.
     """
-    voxel, placed = voxel or choose_voxel_side(positions), positions - positions.min(axis=0)
-    _, first, rows = np.unique(voxel_keys(placed, voxel), return_index=True, return_inverse=True)
-    voxels = cKDTree(np.floor(placed[first] / voxel))
+    cells = np.floor((positions - positions.min(axis=0)) / (voxel or choose_voxel_side(positions)))
+    found, first, rows = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    rows, voxels = rows.ravel(), cKDTree(found)  # NumPy 2.0 returns a column
     pairs = voxels.query_pairs(TOUCHING, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(voxels.n,) * 2)
     count, labels = connected_components(graph, directed=False)

@@ -57,6 +57,7 @@ class Lighting:
 
 FASTEST_GIF = 50  # frames a second that browsers show
 MOST_VIEWS = 1000  # of a fit
+MOST_PORT = 65535
 FEWEST_SPLATS, MOST_SPLATS = 6, 300_000  # that are asked for: one for each side; more than viewers on telephones draw
 
 
@@ -157,7 +158,8 @@ class Render(CloudOptions):
     elevation: float = 20.0
     """Degrees above the horizon."""
     resolution: int | None = None
-    """Pixels along each side (default: 512 for surfels, else the size of the training)."""
+    """Pixels along each side (default: 512 for surfels, else the size of the training).  Cameras of a file may have
+    their own size."""
     quality: Quality = "best"
     """balanced: three quarters of the size, enlarged; draft: discs and light without the CNN.  The paper's network
     takes a quarter, half or all of its training samples per ray, near the points; trained: exactly as in training."""
@@ -294,5 +296,6 @@ class View(CloudOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.reached_at is not None and not re.fullmatch(r"([\w.-]+|\[[\da-fA-F:.]+\])(:\d+)?", self.reached_at):
-            raise ValueError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")
+        place = re.fullmatch(r"(?:[\w.-]+|\[[\da-fA-F:.]+\])(?::(\d{1,5}))?", self.reached_at or "")
+        if self.reached_at is not None and (place is None or int(place[1] or 0) > MOST_PORT):
+            raise UserError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")

@@ -28,6 +28,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -45,7 +46,7 @@ from spnr_jax.config import Quality, SurfelConfig
 from spnr_jax.errors import UserError, require
 from spnr_jax.formats import images
 from spnr_jax.formats.array_files import pack_arrays
-from spnr_jax.formats.gaussian_files import check_suffix, spz_of, write_splats
+from spnr_jax.formats.gaussian_files import check_suffix, fits_spz, spz_of, write_splats
 from spnr_jax.kernels.cloud_arrays import make_cloud
 from spnr_jax.kernels.records import AnyArray, Camera, Gaussians, Light, PointCloud, Surfels, SurfelScene
 from spnr_jax.method import surfel_method, surfel_renderer
@@ -102,6 +103,8 @@ def share(options: Share, note: Say) -> str:
     render_options = make_render_options(options, options.cloud, options.run)
     ready = prepare_cloud(render_options, note)
     gaussians = _splats(ready, options, note)
+    if not fits_spz(gaussians):
+        note("a .spz holds no splats of this size: those of the page are in another unit")
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
     caption = " · ".join(filter(None, [describe_source(render_options), options.credit]))
@@ -123,19 +126,24 @@ def _splats(ready: PreparedObject, options: Export | Share, note: Say) -> Gaussi
         volume=ready.volume,
     )
     if (origin := ready.placed.origin).any():
-        note(f"splats lie around the origin; it is at {' '.join(f'{x:.0f}' for x in origin)} in the file")
+        note(f"splats lie around the origin; it is at {' '.join(f'{x:.15g}' for x in origin)} in the file")
     return gaussians
 
 
 def page(
     gaussians: Gaussians, poster: np.ndarray, camera: Camera, view: tuple[float, float], title: str, note: str
 ) -> bytes:
-    """The page: splats, a picture from `camera`, which stands at `view`, azimuth and elevation in degrees."""
+    """The page: splats, a picture from `camera`, which stands at `view`, azimuth and elevation in degrees.
+
+    Splats that are too small or too large for a .spz file are scaled.
+    """
     pose = np.asarray(camera.cam_to_world, np.float64)
     target = np.asarray(gaussians.position, np.float64).mean(axis=0)
     distance = float((pose[:, 3] - target) @ pose[:, 2])
     target = pose[:, 3] - distance * pose[:, 2]  # on the line of sight
-    start = {"azimuth": view[0], "elevation": view[1], "distance": distance, "target": target.tolist()}
+    unit = 1.0 if fits_spz(gaussians) else distance
+    gaussians = replace(gaussians, position=gaussians.position / unit, scale=gaussians.scale / unit)
+    start = {"azimuth": view[0], "elevation": view[1], "distance": distance / unit, "target": (target / unit).tolist()}
     jpeg = io.BytesIO()
     Image.fromarray(images.to_uint8(poster)).save(jpeg, "jpeg", quality=POSTER_QUALITY)
     parts = {

@@ -214,6 +214,14 @@ def test_what_is_not_to_be_seen_is_left_out_with_a_line_and_kept_on_demand(tmp_p
 # Precision, repeats
 
 
+@pytest.mark.parametrize("size", [1e-6, 1e-4, 0.3, 30])
+def test_small_clouds_keep_their_shape_wherever_they_lie(tmp_path, size):
+    points = np.array([11.5712345, 48.1412345, 0.03]) + size * BALL
+    np.save(tmp_path / "a.npy", points)
+    placed = place_cloud(tmp_path / "a.npy", up="y")
+    np.testing.assert_allclose(placed.cloud.positions + placed.origin, points, rtol=0, atol=1e-5 * size)
+
+
 def test_meshes_at_map_coordinates_keep_their_shape(tmp_path):
     content = "".join("v {:.4f} {:.4f} {:.4f}\n".format(*(UTM + 0.2 * corner)) for corner in SQUARE) + OBJ_FACE
     floats_in_text = square_ply("float", RGB, (0, 1, 0), UTM + 0.2 * SQUARE)

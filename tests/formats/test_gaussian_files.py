@@ -3,6 +3,7 @@
 Without a Chromium and npm's three (support/three_js.py) the latter tests are skipped.
 """
 
+import dataclasses
 import gzip
 
 import numpy as np
@@ -50,6 +51,16 @@ def test_another_suffix_or_a_folder_is_refused_in_one_line(tmp_path, name):
         gaussian_files.write_splats(tmp_path / name, splat_balls.ball(10))
     assert "\n" not in str(refused.value)
     assert name in str(refused.value)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e5])
+def test_splats_of_a_size_that_no_spz_can_hold_are_refused_there(tmp_path, factor):
+    splats = splat_balls.ball(50)
+    sized = dataclasses.replace(splats, position=factor * splats.position, scale=factor * splats.scale)
+    with pytest.raises(ValueError, match="holds no splats .* units wide: write a .ply, or choose another unit"):
+        gaussian_files.write_splats(tmp_path / "a.spz", sized)
+    assert gaussian_files.write_splats(tmp_path / "a.ply", sized)
+    assert not (tmp_path / "a.spz").exists()
 
 
 # Read as clouds

@@ -1,6 +1,7 @@
 import errno
 import importlib.util
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,6 +101,30 @@ def test_an_mp4_has_every_frame(tmp_path):
     path, reason = write_turntable(tmp_path / "a.mp4", [frame[:63, :61] for frame in shaded_frames(10)], fps=10)
     assert (path, reason) == (tmp_path / "a.mp4", "")
     assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 10
+
+
+@pytest.mark.parametrize("says", ["echo full >&2; ", ""])
+def test_an_mp4_that_ffmpeg_cannot_write_leaves_the_one_before(tmp_path, monkeypatch, says):
+    broken, film = tmp_path / "ffmpeg", tmp_path / "a.mp4"
+    broken.write_text(f'#!/bin/sh\n{says}cat > /dev/null; for out; do :; done; echo half > "$out"; exit 1\n')
+    broken.chmod(0o755)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", SimpleNamespace(get_ffmpeg_exe=lambda: str(broken)))
+    film.write_text("whole")
+    with pytest.raises(
+        ValueError, match=rf"a.mp4: ffmpeg could not write it \({'full' if says else 'no reason given'}\)"
+    ):
+        write_turntable(film, shaded_frames(2), fps=10)
+    assert (film.read_text(), {place.name for place in tmp_path.iterdir()}) == ("whole", {"ffmpeg", "a.mp4"})
+
+
+@pytest.mark.parametrize(
+    ("fps", "said"), [(16, ""), (24, ""), (30, "33.3 frames a second"), (45, "50 frames a second")]
+)
+def test_a_gif_says_the_rate_at_which_it_plays_where_it_is_another(tmp_path, fps, said):
+    path, reason = write_turntable(tmp_path / "a.gif", shaded_frames(2), fps)
+    assert reason == (said and f"{said}, as a .gif counts hundredths of a second")
+    with Image.open(path) as film:
+        assert 1000 / film.info["duration"] == pytest.approx(float(said.split()[0]) if said else fps, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,10 @@
 """`spnr export --splats` and `spnr share`: what they write, and what they refuse in one line."""
 
+import base64
+import dataclasses
+import gzip
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +86,24 @@ def test_ctrl_c_while_a_file_is_written_leaves_what_was_there(cloud, tmp_path, m
     assert out.read_bytes() == b"before"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "out.spz"]
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_page_of_splats_that_are_too_small_for_its_format_is_that_of_larger_ones():
+    splats, camera, poster = splat_balls.ball(50), splat_balls.camera(size=8), np.ones((8, 8, 3), np.float32)
+    pose = np.asarray(camera.cam_to_world)
+    small = dataclasses.replace(splats, position=1e-4 * splats.position, scale=1e-4 * splats.scale)
+    near = dataclasses.replace(camera, cam_to_world=np.column_stack([pose[:, :3], 1e-4 * pose[:, 3]]))
+    starts, widths = [], []
+    for one, seen in ((splats, camera), (small, near)):
+        content = export.page(one, poster, seen, (30.0, 20.0), "t", "n").decode()
+        start = json.loads(re.search(r"const START = (.*?);", content)[1])
+        packed = gzip.decompress(base64.b64decode(re.search(r'id="data">([^<]*)<', content)[1]))
+        logarithms = np.frombuffer(packed, np.uint8, 150, 16 + 13 * 50) / 16 - 10
+        starts.append(start)
+        widths.append(np.exp(logarithms) / start["distance"])
+    assert starts[1]["distance"] == pytest.approx(1)
+    np.testing.assert_allclose(starts[1]["target"], np.array(starts[0]["target"]) / starts[0]["distance"], atol=1e-6)
+    np.testing.assert_allclose(widths[1], widths[0], rtol=0.07)  # steps of 1/16
 
 
 def test_a_page_that_is_too_large_is_refused(monkeypatch):
