@@ -24,8 +24,9 @@ from data_gen.plan.tasks import PAPER_COUNTS, GenerateConfig, Plan, Task, check_
 from data_gen.render import light
 from data_gen.render.variant import choose_variant
 from data_gen.store import layout
-from data_gen.store.check import checksum_of
+from data_gen.store.check import checksum_of, read_details
 from spnr_jax.errors import UserError
+from spnr_jax.formats.columns import list_names
 from spnr_jax.formats.images import check_place, read_envmap, write_whole
 from spnr_jax.surfels.skies import indoor_envmap
 
@@ -113,6 +114,9 @@ def generate(config: GenerateConfig) -> None:
 def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) -> dict[str, str]:
     """Make the objects that are not there yet; return the reason for each that was left out, by id."""
     done = layout.list_completed(config.out)
+    if changed := [task.object_id for task in tasks if task.object_id in done and has_changed(config.out, task)]:
+        said = f"{len(changed)} objects are kept whose mesh files changed since: {list_names(changed)}"
+        print(f"{config.out}: {said}; remove their folders in objects/ to make them anew", file=sys.stderr)
     missing = [task for task in tasks if task.object_id not in done]
     if not missing:
         return {}
@@ -124,6 +128,14 @@ def make_missing(config: GenerateConfig, tasks: Sequence[Task], settings: dict) 
     rejected = make_objects(config, missing, lights, variant)
     # the process of one that is there died here, but another run has made it
     return {name: reason for name, reason in rejected.items() if not layout.has_object(config.out, name)}
+
+
+def has_changed(dataset: Path, task: Task) -> bool:
+    """Whether the mesh file of a complete object is newer than the object, and another one than it was made of."""
+    record = dataset / "objects" / task.object_id / layout.LAST_FILE
+    if task.path is None or task.path.stat().st_mtime <= record.stat().st_mtime:
+        return False
+    return read_details(dataset, task.object_id).get("source", {}).get("sha256") != checksum_of(task.path)
 
 
 def make_lights(config: GenerateConfig) -> light.Lights:

@@ -85,6 +85,21 @@ def test_a_run_with_another_setting_is_refused_in_one_line_and_changes_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+def test_meshes_that_changed_are_named_and_touched_ones_are_not(meshes, finished, generate_here, tmp_path, capsys):
+    folder = tmp_path / "meshes"
+    shutil.copytree(meshes, folder)
+    for path in folder.iterdir():
+        path.touch()
+    again = [finished, "--meshes", folder, *SMALL]
+    before = contents(finished)
+    assert generate_here(*again) == 0
+    assert "changed since" not in capsys.readouterr().err
+    shutil.copy(folder / "thing_0.ply", folder / "thing_2.ply")
+    assert generate_here(*again) == 0
+    assert "1 objects are kept whose mesh files changed since: thing_2; remove" in capsys.readouterr().err
+    assert contents(finished) == before
+
+
 def test_an_object_does_not_depend_on_which_others_are_made():
     alone = tasks.plan_objects(tasks.GenerateConfig(out=Path("x"), objects=2, categories=("lamp", "car")))
     among = tasks.plan_objects(tasks.GenerateConfig(out=Path("x"), objects=8))
