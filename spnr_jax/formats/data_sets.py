@@ -58,14 +58,18 @@ class Dataset:
         """Sampling of the objects' points; every prefix of an even cloud is evenly spread, too."""
         return "even" if self.settings.get("settings", {}).get("spread") == "even" else "random"
 
+    @property
+    def light(self) -> str:
+        """Name of the light of all views; that of the room if none is named."""
+        described = self.settings.get("environment_map")
+        return described.get("name", ROOM) if isinstance(described, dict) else ROOM
+
     def check_lit_by_room(self) -> None:
         """ValueError if one light other than the room lights all views: the data set does not store it."""
-        described = self.settings.get("environment_map")
-        name = described.get("name", ROOM) if isinstance(described, dict) else ROOM
-        if name != ROOM:
+        if self.light != ROOM:
             raise UserError(
-                f"{self.folder}: lit by {name}, which it does not hold; generate it with --lights FOLDER, a light for "
-                "each view, or in Python give spnr_jax.training.trainer.train its light"
+                f"{self.folder}: lit by {self.light}, which it does not hold; generate it with --lights FOLDER, a light "
+                "for each view, or in Python give spnr_jax.training.trainer.train its light"
             )
 
 

@@ -35,6 +35,7 @@ from spnr_jax.kernels.records import Camera, PointCloud
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.scoring.picture_scores import Scores, differences, flip, lpips, metric_settings, summarise
+from spnr_jax.training.checkpoint import read_light
 from spnr_jax.training.gbuffers import average_squares
 from spnr_jax.training.weights import Trained, read_trained
 
@@ -238,7 +239,9 @@ def evaluate(
     say: Callable[[str], None] = print,
 ) -> Evaluation:
     """Scores of a run's newest checkpoint on a split, under the name of its method."""
-    trained = read_trained(run, say)
+    trained, light = read_trained(run, say), read_light(Path(run))
+    if light not in (None, dataset.light) and not method_of(trained.config.model).takes_light:
+        say(f"{run} was trained in another light ({light}) than that of {dataset.folder} ({dataset.light})")
     return compare({trained.config.model.method: trained}, dataset, split, gallery_objects, say)
 
 

@@ -1,7 +1,7 @@
 """Run folders on disk: the config, and checkpoints of the training state through Orbax.
 
     RUN/config.json          the TrainConfig
-    RUN/data.txt             a checksum of the data set's settings and training objects, files included
+    RUN/data.txt             a checksum of the data set's settings and training objects, files included; and its light
     RUN/checkpoints/STEP/    one state; appears complete or not at all
     RUN/training.lock        empty; locked while a process trains there
 
@@ -65,12 +65,17 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 
 def record_data(run: Path, dataset: Dataset) -> bool:
-    """Writes the data set's checksum to the run folder; False if its checkpoints began with another data set."""
+    """Writes checksum and light of the data set to the run folder; False if its checkpoints began with another one."""
     path, checksum = run / "data.txt", data_sets.checksum(dataset, "train")
-    known = path.read_text() if path.is_file() else None
-    if known != checksum:
-        write_whole(path, checksum.encode())
+    known = path.read_text().partition("\n")[0] if path.is_file() else None
+    write_whole(path, f"{checksum}\n{dataset.light}\n".encode())
     return known in (None, checksum) or not (run / "checkpoints").is_dir()
+
+
+def read_light(run: Path) -> str | None:
+    """Name of the light of the data set that a run was last trained on, None if it is not recorded."""
+    path = run / "data.txt"
+    return path.read_text().partition("\n")[2].strip() or None if path.is_file() else None
 
 
 def read_config(run: Path | str) -> TrainConfig:

@@ -105,6 +105,17 @@ def test_radii_are_chosen_on_small_pictures_of_the_same_views(monkeypatch):
     np.testing.assert_allclose(less, means, atol=0.02)
 
 
+def test_data_in_another_light_than_that_of_the_training_are_named(tmp_path, monkeypatch):
+    run, one, said = shutil.copytree(tiny_untrained.run(), tmp_path / "run"), tiny_dataset.dataset(), []
+    monkeypatch.setattr(evaluation, "compare", lambda *_: tiny_untrained.evaluated())
+    dusk = replace(one, settings=one.settings | {"environment_map": {"name": "dusk.hdr"}})
+    for trained, scored in ((None, dusk), (one, one), (one, dusk), (dusk, dusk)):
+        if trained:
+            checkpoint.record_data(run, trained)
+        evaluation.evaluate(run, scored, say=said.append)
+    assert said == [f"{run} was trained in another light (procedural room) than that of {one.folder} (dusk.hdr)"]
+
+
 def test_an_empty_training_split_is_an_error_that_names_it(tmp_path):
     copy = shutil.copytree(tiny_dataset.dataset().folder, tmp_path / "data")
     (copy / "splits" / "train.txt").write_text("")
