@@ -67,10 +67,9 @@ class Dataset:
     def check_lit_by_room(self) -> None:
         """ValueError if one light other than the room lights all views: the data set does not store it."""
         if self.light != ROOM:
-            raise UserError(
-                f"{self.folder}: lit by {self.light}, which it does not hold; generate it with --lights FOLDER, a light "
-                "for each view, or in Python give spnr_jax.training.trainer.train its light"
-            )
+            lit = f"{self.folder}: lit by {self.light}, which it does not hold"
+            advice = "generate it with --lights FOLDER, a light for each view"
+            raise UserError(f"{lit}; {advice}, or in Python give spnr_jax.training.trainer.train its light")
 
 
 def open_dataset(folder: Path | str) -> Dataset:
