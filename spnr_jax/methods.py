@@ -113,7 +113,7 @@ METHODS: dict[str, Method] = {
 EXTRA_FIELDS: dict[type, tuple[str, ...]] = {
     TrainConfig: ("trains", "pixel_stride"),
     LossConfig: ("pixel", "masked"),
-    NetworkConfig: ("method", "source"),
+    NetworkConfig: ("method", "source", "pixel_stride"),
 }
 
 
@@ -210,6 +210,8 @@ def from_dict(values: Any, kind: Any = TrainConfig, path: str = "") -> Any:
     extra = EXTRA_FIELDS.get(kind, ())
     if kind is LossConfig and values.get("pixel") == "mse":  # then l1_weight was that of squared errors
         values = values | {"l1_weight": 0.0, "mse_weight": values.get("l1_weight")}
+    if kind is TrainConfig and isinstance(values.get("model"), dict):  # the stride is one of networks now
+        values = values | {"model": {"pixel_stride": values.get("pixel_stride", 1)} | values["model"]}
     if kind is NetworkConfig:
         kind = _find_config_class(values.get("method"), values.get("source"), path)
     kinds = types_of(kind)

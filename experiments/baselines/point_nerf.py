@@ -40,6 +40,7 @@ from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.numerics import length, per_feature
 from spnr_jax.kernels.records import Batch, Camera, Key, PointCloud, Rays, Rendering, record
 from spnr_jax.kernels.voxels import map_existing
+from spnr_jax.method.inference import opacity_loss
 from spnr_jax.methods import Outcome
 from spnr_jax.nn.paper_layers import encode_direction, waves
 
@@ -320,14 +321,15 @@ class PointNeRF(nn.Module):
 def loss(
     variables: dict, batch: Batch, key: Key | None = None, *, config: TrainConfig
 ) -> tuple[Float[Array, ""], Outcome]:
-    """(mean squared error of the rays with a point in reach, outcome)."""
+    """(errors of the rays with a point in reach, and of the opacity, weighted as the config says; outcome)."""
     assert isinstance(config.model, PointNeRFConfig)
     key, batch = ray_chunks.choose_pixels(key, batch, config.model.pixel_stride)
     rendering: Any = PointNeRF(config.model).apply(variables, batch.cloud, batch.camera, key, train=True)
-    hit, reference = rendering.acc > 0, jnp.asarray(batch.image)
-    squared = jnp.sum(jnp.where(hit[..., None], (rendering.image - reference) ** 2, 0))
+    hit, reference = rendering.acc[..., None] > 0, jnp.asarray(batch.image)
+    off, count = jnp.where(hit, rendering.image - reference, 0), jnp.maximum(3 * jnp.sum(hit), 1)
+    value = config.loss.l1_weight * jnp.sum(jnp.abs(off)) + config.loss.mse_weight * jnp.sum(off**2)
     metrics = {"psnr": jnp.mean(psnr(rendering.image, reference)), "l1": losses.l1(rendering.image, reference)}
-    return squared / jnp.maximum(3 * jnp.sum(hit), 1), Outcome(metrics)
+    return value / count + opacity_loss(config, rendering.acc, jnp.asarray(batch.alpha)), Outcome(metrics)
 
 
 def render_object(

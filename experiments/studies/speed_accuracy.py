@@ -196,7 +196,7 @@ def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the tables and the plot."""
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects, max(options.counts))
-    asked = {"objects": names, "views": options.views, "runs": checksums(options.runs)}
+    asked = {"objects": names, "views": options.views, "runs": list(checksums(options.runs).items())}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
     rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]
     telling = sorted(rows, key=lambda row: row.setting.group != "level")  # the most telling ones first

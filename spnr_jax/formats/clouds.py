@@ -213,7 +213,7 @@ def _find_origin(positions: np.ndarray) -> np.ndarray:
     low, high = inner_box(positions)
     step = np.spacing(np.float32(np.maximum(np.abs(low), np.abs(high)).max()))
     extent = (high - low).max()
-    if not step > COARSEST_STEP * extent > 0:
+    if not step > COARSEST_STEP * extent > np.finfo(np.float32).tiny:
         return np.zeros(3)
     finer = 10.0 ** max(0, -np.floor(np.log10(extent)))
     return np.floor(low * finer) / finer

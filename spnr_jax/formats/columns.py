@@ -33,7 +33,7 @@ SPLAT = ("f_dc_0", "f_dc_1", "f_dc_2")  # the constant spherical-harmonic coeffi
 # ignored in names: CloudCompare's prefix, separators, umlauts (\ufffd: of another encoding), British spelling, and
 # words such as `vertex`
 SILENT = re.compile(
-    r"^(scalar_|grid (?=east|north))|[\s.:_-]+|[äöüß\ufffd]|(?<=colo)u(?=r)"
+    r"^(scalar_)?grid[\s_]+(?=east|north)|^scalar_|[\s.:_-]+|[äöüß\ufffd]|(?<=colo)u(?=r)"
     r"|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
 )
 ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")

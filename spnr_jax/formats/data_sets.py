@@ -98,10 +98,17 @@ def open_dataset(folder: Path | str) -> Dataset:
 def checksum(dataset: Dataset, *splits: str) -> str:
     """SHA-256 of the settings and of splits: the names of their objects, and the checksums of these objects' files."""
     found = hashlib.sha256(json.dumps(dataset.settings, sort_keys=True).encode())
-    for name in (name for split in splits for name in (split, *dataset.splits[split])):
-        record = dataset.folder / "objects" / name / "object.json"
-        found.update(name.encode() + b"\n" + (record.read_bytes() if record.is_file() else b""))
+    for split in splits:
+        found.update(split.encode() + b"\n")
+        for name in dataset.splits[split]:
+            found.update(name.encode() + b"\n" + read_record(dataset, name))
     return found.hexdigest()
+
+
+def read_record(dataset: Dataset, name: str) -> bytes:
+    """The content of an object's object.json, with the checksums of its files; empty if it is missing."""
+    path = dataset.folder / "objects" / name / "object.json"
+    return path.read_bytes() if path.is_file() else b""
 
 
 def is_plain_name(name: str) -> bool:

@@ -103,8 +103,9 @@ def fits_spz(gaussians: Gaussians) -> bool:
 def spz_of(gaussians: Gaussians) -> bytes:
     """The splats as a .spz file; ValueError if it cannot hold ones of this size."""
     if not fits_spz(gaussians):
-        width = float(np.median(np.asarray(gaussians.scale).max(axis=1)))
-        raise UserError(f"a .spz file holds no splats {width:.2g} units wide: write a .ply, or choose another unit")
+        width, far = np.median(np.asarray(gaussians.scale).max(axis=1)), np.abs(gaussians.position).max()
+        found = f"splats {width:.2g} units wide, up to {far:.2g} from the origin"
+        raise UserError(f"a .spz file cannot hold {found}: write a .ply, or choose another unit")
     names = "position", "scale", "rotation", "opacity", "harmonics"
     position, scale, rotation, opacity, harmonics = (np.asarray(getattr(gaussians, x), np.float64) for x in names)
     bits = int(np.clip(FRACTION_BITS - np.ceil(np.log2(max(np.abs(position).max(), 1e-6))), 0, 31))

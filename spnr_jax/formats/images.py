@@ -11,6 +11,7 @@ import contextlib
 import io
 import os
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -128,15 +129,18 @@ def write_turntable(path: str | Path, frames: list[np.ndarray], fps: float | int
             return path, ""
         except (ImportError, RuntimeError):  # no package, or no ffmpeg in it for this platform
             reason = "written as .gif: .mp4 needs ffmpeg (pip install imageio-ffmpeg)"
-    path, shown = path.with_suffix(".gif"), 1 / (round(1 / (fps * CENTISECOND)) * CENTISECOND)
-    write_whole(path, _gif(pictures, fps))
-    if abs(shown - fps) > ROUNDED * fps:
+    path, steps = path.with_suffix(".gif"), max(round(1 / (fps * CENTISECOND)), 1)
+    write_whole(path, _gif(pictures, steps))
+    if abs((shown := 1 / (steps * CENTISECOND)) - fps) > ROUNDED * fps:
         reason += f"{'; ' * bool(reason)}{shown:.3g} frames a second, as a .gif counts hundredths of a second"
     return path, reason
 
 
-def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
-    """A looping GIF; all frames share one palette, so that still surfaces do not flicker; the background is exact."""
+def _gif(pictures: list[np.ndarray], steps: int) -> bytes:
+    """A looping GIF that shows each picture for `steps` hundredths of a second.
+
+    All frames share one palette, so that still surfaces do not flicker; the background is exact.
+    """
     chosen = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).round().astype(int))
     step = max(min(pictures[0].shape[:2]) // PALETTE_PIXELS, 1)  # at full size 24 frames of 512 px would take 5.9 s
     strip = Image.fromarray(np.concatenate([pictures[i][::step, ::step] for i in chosen]))
@@ -146,7 +150,7 @@ def _gif(pictures: list[np.ndarray], fps: float | int) -> bytes:
     images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     for image, picture in zip(images, pictures, strict=True):  # Pillow takes any close colour
         image.paste(place, None, Image.fromarray((picture == background).all(axis=-1)))
-    milliseconds = round(1 / (fps * CENTISECOND)) * round(1000 * CENTISECOND)
+    milliseconds = steps * round(1000 * CENTISECOND)
     stream = io.BytesIO()
     images[0].save(
         stream, "gif", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=False
@@ -161,13 +165,18 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
     height, width = (size - size % 2 for size in pictures[0].shape[:2])
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
     wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY), "-v", "error", "-y"]
-    frames = b"".join(np.ascontiguousarray(picture[:height, :width]).tobytes() for picture in pictures)
-    with _in_its_place(path) as unfinished:
+    with _in_its_place(path) as unfinished, tempfile.TemporaryFile() as said:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), *given, *wanted, str(unfinished)]
-        done = subprocess.run(command, input=frames, capture_output=True)
-        if done.returncode:
-            said = done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"]
-            raise UserError(f"{path}: ffmpeg could not write it ({said[-1]})")
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said) as ffmpeg:
+            assert ffmpeg.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # it has stopped, and says why
+                for picture in pictures:
+                    ffmpeg.stdin.write(np.ascontiguousarray(picture[:height, :width]).tobytes())
+                ffmpeg.stdin.close()
+        if ffmpeg.returncode:
+            said.seek(0)
+            lines = said.read().decode(errors="replace").strip().splitlines() or ["no reason given"]
+            raise UserError(f"{path}: ffmpeg could not write it ({lines[-1]})")
 
 
 def template(path: Path) -> Template:

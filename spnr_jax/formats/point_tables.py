@@ -47,6 +47,7 @@ PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
 PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
+DECIMAL = re.compile(r"(?<!\d)0,|,(?!\d{3}(?!\w))")  # a comma that separates no thousands
 WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 EMPTY = {mark: re.compile(rf"(?:^|(?<={mark}))[^\S{mark}]*(?={mark}|$)") for mark in ",;\t"}  # a missing number
 # missing numbers of C, Excel and databases
@@ -122,7 +123,8 @@ def _rows_of_numbers(head: Head, lines: Iterator[Line], counted: Counter[str]) -
         elif text.startswith(COMMENTS):
             counted["commented"] += _is_commented_row(text, len(head.fields))
         elif text and text not in names:
-            yield number, EMPTY[head.delimiter].sub("nan", text) if head.delimiter else text
+            text = EMPTY[head.delimiter].sub("nan", text) if head.delimiter else text
+            yield number, text if head.delimiter == "," else text.replace(",", ".")
 
 
 def _load_table(rows: list[Line], head: Head, words: Collection[int]) -> np.ndarray:
@@ -267,7 +269,8 @@ def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None
     texts = [text for _, text in rows]
     with contextlib.suppress(ValueError):
         return load(texts)
-    texts = [text if delimiter == "," else text.replace(",", ".") for text in texts]  # decimal commas
+    if delimiter is None and any(map(DECIMAL.search, texts)):
+        texts = [text.replace(",", ".") for text in texts]
     texts = [FORTRAN.sub(r"\1e", WHOLE.sub("", UNDEFINED.sub("nan", DASH.sub("nan", text)))) for text in texts]
     with contextlib.suppress(ValueError):
         return load(texts)

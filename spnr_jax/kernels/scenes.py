@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
 from spnr_jax.kernels.cloud_arrays import find_extent, first_in_voxels
@@ -24,7 +23,7 @@ Box = Sequence[float | int]
 
 CROWD = 4.0  # points per voxel, on average
 COARSEST, FINER, TRIES = 4.0, 2**0.5, 40  # fewest voxels along the extent; ratio and number of the sides tried
-TOUCHING = 1.8  # sides: voxels that share a face, an edge or a corner lie closer; others at least 2 apart
+NEIGHBORS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]  # half
 SAMPLE, PLANES, ROUNDS = 4096, 512, 3  # points that vote, candidate planes, refits
 CLOSE = 0.5  # voxels: largest distance of an inlier from the plane
 THICK = 3.0  # standard deviations of the inliers, at most a voxel: removing the plane removes its noise
@@ -118,11 +117,17 @@ def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None 
 
     Ties in size are broken by the order of the clusters' first points.
     """
-    cells = np.floor((positions - positions.min(axis=0)) / (voxel or choose_voxel_side(positions)))
-    found, first, rows = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    rows, voxels = rows.ravel(), cKDTree(found)  # NumPy 2.0 returns a column
-    pairs = voxels.query_pairs(TOUCHING, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(voxels.n,) * 2)
+    x, y, z = (_slices(axis, voxel or choose_voxel_side(positions)) for axis in positions.T)
+    deep, wide = int(z.max()) + 2, int(y.max()) + 2
+    keys, first, rows = np.unique((x * wide + y) * deep + z, return_index=True, return_inverse=True)
+    ends = []
+    for dx, dy, dz in NEIGHBORS:
+        wanted = keys + (dx * wide + dy) * deep + dz
+        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        touching = np.flatnonzero(keys[place] == wanted)
+        ends.append(np.stack([touching, place[touching]]))
+    one, two = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(len(one), bool), (one, two)), shape=(len(keys), len(keys)))
     count, labels = connected_components(graph, directed=False)
     sizes = np.bincount(labels[rows], minlength=count)
     begins = np.full(count, len(positions))
@@ -130,6 +135,12 @@ def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None 
     rank = np.empty(count, np.int64)
     rank[np.lexsort((begins, -sizes))] = np.arange(count)
     return rank[labels[rows]]
+
+
+def _slices(axis: np.ndarray, voxel: float) -> np.ndarray:
+    """Indices (points,) from 1 of the slices along an axis; a gap of empty slices counts as one."""
+    found, rows = np.unique(np.floor((axis - axis.min()) / voxel), return_inverse=True)
+    return 1 + np.concatenate([[0], np.cumsum(np.minimum(np.diff(found), 2))]).astype(np.int64)[rows]
 
 
 def find_dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0) -> Plane | None:

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from spnr_jax.errors import UserError
 from spnr_jax.kernels import triangles
-from spnr_jax.kernels.cloud_arrays import check_cloud, check_finite, refuse_tracers
+from spnr_jax.kernels.cloud_arrays import check_cloud, refuse_tracers
 from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
 from spnr_jax.surfels.constants import NEIGHBORS
@@ -29,8 +30,9 @@ def neighbors(cloud: PointCloud) -> Int[np.ndarray, "*batch points 20"]:
     """
     check_cloud(cloud, "neighbors", batched=True)
     refuse_tracers(cloud, "neighbors")
-    check_finite(cloud, "neighbors")
     positions, mask = np.asarray(cloud.positions), np.asarray(cloud.mask)
+    if not np.isfinite(positions[mask]).all():
+        raise UserError("neighbors: cloud.positions has NaN or infinity; remove those points")
     normals = None if cloud.normals is None else np.asarray(cloud.normals)
     found = np.full((*mask.shape, NEIGHBORS), -1, np.int32)
     for cloud_index in np.ndindex(mask.shape[:-1]):

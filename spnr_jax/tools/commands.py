@@ -298,4 +298,5 @@ class View(CloudOptions):
         super().__post_init__()
         place = re.fullmatch(r"(?:[\w.-]+|\[[\da-fA-F:.]+\])(?::(\d{1,5}))?", self.reached_at or "")
         if self.reached_at is not None and (place is None or int(place[1] or 0) > MOST_PORT):
-            raise UserError(f"--reached-at {self.reached_at}: expected HOST or HOST:PORT, without http:// and path")
+            form = f"expected HOST or HOST:PORT, at most {MOST_PORT}, without http:// and path"
+            raise UserError(f"--reached-at {self.reached_at}: {form}")

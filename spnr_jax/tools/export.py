@@ -104,7 +104,7 @@ def share(options: Share, note: Say) -> str:
     ready = prepare_cloud(render_options, note)
     gaussians = _splats(ready, options, note)
     if not fits_spz(gaussians):
-        note("a .spz holds no splats of this size: those of the page are in another unit")
+        note("a .spz cannot hold these splats: those of the page are in another unit")
     camera = ready.model.camera(ready.volume, options.azimuth, options.elevation, surfaces.RESOLUTION)
     poster = np.asarray(ready.model.render(ready.volume, camera, light=ready.light).image)
     caption = " · ".join(filter(None, [describe_source(render_options), options.credit]))

@@ -32,7 +32,7 @@ from spnr_jax.devices import programs
 from spnr_jax.errors import UserError
 from spnr_jax.formats.array_files import pack_arrays, read_arrays
 from spnr_jax.formats.clouds import MOST_EVEN
-from spnr_jax.formats.data_sets import Dataset, ObjectData, checksum, read_object
+from spnr_jax.formats.data_sets import Dataset, ObjectData, read_object, read_record
 from spnr_jax.formats.images import to_uint8, write_whole
 from spnr_jax.kernels import cameras, losses
 from spnr_jax.kernels.cleaning import Cleaned, clean_columns
@@ -129,8 +129,9 @@ def loss(
 
 def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Path, variables: dict) -> list[KeptView]:
     """The views of the data set; missing, broken and other files are made first; `variables` hold the densifier."""
-    views, source = [], digest(dataset, light, config, variables)
+    views, common = [], digest(dataset, light, config, variables)
     for name in tqdm(dataset.splits["train"], "G-buffers", unit="object"):
+        source = np.frombuffer(hashlib.sha256(common + read_record(dataset, name)).digest(), np.uint8)
         paths = [folder / f"{name}.{number}.npz" for number in range(CLOUDS)]
         found = [_doublings(path, source) for path in paths]
         item = read_object(dataset, name) if None in found else None
@@ -146,15 +147,15 @@ def make_missing(dataset: Dataset, light: Light, config: TrainConfig, folder: Pa
     return views
 
 
-def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict) -> UInt8[np.ndarray, "32"]:
+def digest(dataset: Dataset, light: Light, config: TrainConfig, variables: dict) -> bytes:
     """A checksum of everything but object and cloud that G-buffers are made of."""
     names = "seed", "min_points", "max_points", "even_share", "views_per_object"
     chosen = [getattr(config, x) for x in names]
     numbers = dataclasses.astuple(CONSTANTS), list(shader.INPUTS.items()), list(shader.MAPS.items())
-    made_of = hashlib.sha256(json.dumps([chosen, checksum(dataset, "train"), numbers]).encode())
+    made_of = hashlib.sha256(json.dumps([chosen, dataset.settings, numbers]).encode())
     for leaf in jax.tree.leaves((light, variables)):
         made_of.update(np.asarray(leaf).tobytes())
-    return np.frombuffer(made_of.digest(), np.uint8)
+    return made_of.digest()
 
 
 def _doublings(path: Path, source: UInt8[np.ndarray, "32"]) -> list[int] | None:

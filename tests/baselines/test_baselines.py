@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from experiments.baselines.points2nerf import Hypernetwork, Points2NeRF
 from spnr_jax.config import LossConfig, OptimizerConfig
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Camera
+from spnr_jax.method import inference
+from spnr_jax.methods import from_dict, to_dict
 from spnr_jax.training import optimisation
 
 pytestmark = pytest.mark.ci  # it trains baselines
@@ -110,6 +113,47 @@ def test_the_training_step_moves_every_weight(name):
         assert 0.05 < hit.mean() < 0.95
         error = (np.asarray(rendering.image) - np.asarray(seen.image)) ** 2
         assert float(metrics["loss"]) == pytest.approx(error[hit].mean(), rel=1e-4)
+
+
+def test_the_loss_of_some_pixels_is_that_of_the_lattice():
+    config = TRAININGS["points2nerf"]
+    variables = {"params": create(config).generator}
+    rest, lattice_key = jax.random.split(jax.random.key(5))
+    thinned = ray_chunks.lattice(lattice_key, BATCH, config.model.pixel_stride)
+    found, _ = jax.jit(partial(points2nerf.loss, config=config))(variables, BATCH, jax.random.key(5))
+    expected, _ = jax.jit(partial(inference.loss, config=config))(variables, thinned, rest)
+    assert float(found) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_rays_that_meet_no_point_have_a_loss_of_0_and_finite_gradients():
+    config = TRAININGS["point_nerf"]
+    params, away = create(config).generator, jax.tree.map(jnp.asarray, BATCH)
+    away = away.replace(cloud=away.cloud.replace(mask=jnp.zeros_like(away.cloud.mask)))
+    of = jax.jit(jax.value_and_grad(lambda params: point_nerf.loss({"params": params}, away, config=config)[0]))
+    value, gradients = of(params)
+    assert value == 0
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(gradients))
+
+
+@pytest.mark.parametrize("weight", ["l1_weight", "mse_weight", "opacity_weight"])
+def test_the_loss_of_point_nerf_is_weighted_as_the_config_says(weight):
+    config = TRAININGS["point_nerf"]
+    variables = {"params": create(config).generator}
+
+    def value(**weights):
+        none = dict.fromkeys(("l1_weight", "mse_weight", "opacity_weight"), 0.0)
+        loss = dataclasses.replace(config.loss, **none | weights)
+        return float(point_nerf.loss(variables, BATCH, config=dataclasses.replace(config, loss=loss))[0])
+
+    assert 0 < value(**{weight: 1.0}) == pytest.approx(value(**{weight: 2.0}) / 2)
+
+
+def test_runs_of_before_the_stride_was_the_networks_are_read():
+    for config in (point_nerf.point_nerf_tiny(), points2nerf.points2nerf_tiny()):
+        values = to_dict(config)
+        values["pixel_stride"] = values["model"].pop("pixel_stride")
+        values["loss"]["masked"] = True
+        assert from_dict(values) == config
 
 
 def test_an_object_without_points_has_a_finite_code():

@@ -118,7 +118,8 @@ def test_an_mp4_that_ffmpeg_cannot_write_leaves_the_one_before(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("fps", "said"), [(16, ""), (24, ""), (30, "33.3 frames a second"), (45, "50 frames a second")]
+    ("fps", "said"),
+    [(16, ""), (24, ""), (30, "33.3 frames a second"), (45, "50 frames a second"), (240, "100 frames a second")],
 )
 def test_a_gif_says_the_rate_at_which_it_plays_where_it_is_another(tmp_path, fps, said):
     path, reason = write_turntable(tmp_path / "a.gif", shaded_frames(2), fps)

@@ -1,5 +1,6 @@
 """Text and arrays of points: what stands around the numbers, and columns without names, told by their values."""
 
+import re
 from codecs import BOM_UTF8
 
 import numpy as np
@@ -115,6 +116,10 @@ TEXTS = {
     "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
     "an array's columns by number, as pandas writes them": ("a.csv", "0,1,2,3,4,5\n" + table(",")),
     "counts of points and columns": ("a.xyz", "420 6\n" + table(" ")),
+    "decimal commas without a 0 before them, and a label": (
+        "a.csv",
+        "x;y;z;r;g;b;label\n,5;,25;nan;1;2;3;7\n" + re.sub(r"\b0,", ",", table(";", ";tree", comma=True)),
+    ),
     "units without brackets": ("a.csv", "x,y,z,r,g,b\nm,m,m,-,-,-\n" + table(",")),
     "names of other programs": ("a.csv", "POINT_X,Point-Y,point.z,Color.R,color_g,Color B\n" + table(",")),
     "a time before each point": ("a.txt", table(" ", columns=TIMED)),

@@ -168,6 +168,7 @@ REFUSED = [
         "1 numbers of the header's types, found '300'",
     ),
     ("a.ply", PLY + b"element vertex 1\nproperty list uchar int x\nend_header\n1 1\n", "found x"),
+    ("a.obj", "v 35 1,351 -1,068\nv -565 -230 983\n", "v 1: expected 3 numbers, found '35 1,351 -1,068'"),
     ("a.xyz", "1 2 3\n4 5\n", "line 2: expected 3 numbers, found '4 5'"),
     ("a.xyz", "1 2 3 " * 6 + "\n", r"shape \(1, 18\)"),
     ("a.csv", "x,y,z\n1,2,3\n(0.5),1,2\n4,5,7\n", r"line 3: expected 3 numbers, found '\(0.5\),1,2'"),

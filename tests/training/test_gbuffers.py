@@ -101,6 +101,11 @@ def test_files_made_of_something_else_are_made_again(monkeypatch, tmp_path):
         for _ in range(2):
             gbuffers.make_missing(**given | change)
         assert len(made) == before + gbuffers.CLOUDS, change
+    gbuffers.make_missing(**given)
+    before = len(made)
+    monkeypatch.setattr(gbuffers, "read_record", lambda *_: b"of another mesh")
+    gbuffers.make_missing(**given)
+    assert len(made) == before + gbuffers.CLOUDS
 
 
 def test_a_stop_while_g_buffers_are_made_ends_the_run_at_once(monkeypatch, tmp_path):
