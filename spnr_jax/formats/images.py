@@ -167,12 +167,11 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
     wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY), "-v", "error", "-y"]
     with _in_its_place(path) as unfinished, tempfile.TemporaryFile() as said:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), *given, *wanted, str(unfinished)]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said) as ffmpeg:
-            assert ffmpeg.stdin is not None
-            with contextlib.suppress(BrokenPipeError):  # it has stopped, and says why
-                for picture in pictures:
-                    ffmpeg.stdin.write(np.ascontiguousarray(picture[:height, :width]).tobytes())
-                ffmpeg.stdin.close()
+        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
+        with contextlib.suppress(BrokenPipeError), ffmpeg:  # broken: it has stopped, and says why
+            for picture in pictures:
+                assert ffmpeg.stdin is not None
+                ffmpeg.stdin.write(np.ascontiguousarray(picture[:height, :width]).tobytes())
         if ffmpeg.returncode:
             said.seek(0)
             lines = said.read().decode(errors="replace").strip().splitlines() or ["no reason given"]
