@@ -66,10 +66,12 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def record_data(run: Path, dataset: Dataset) -> bool:
     """Writes checksum and light of the data set to the run folder; False if its checkpoints began with another one."""
-    path, checksum = run / "data.txt", data_sets.checksum(dataset, "train")
-    known = path.read_text().split("\n")[0] if read_light(run) else None  # without a light: of an earlier version
-    write_whole(path, f"{checksum}\n{dataset.light}\n".encode())
-    return known in (None, checksum) or not (run / "checkpoints").is_dir()
+    path, now = run / "data.txt", f"{data_sets.checksum(dataset, 'train')}\n{dataset.light}\n"
+    before = path.read_text() if path.is_file() else ""
+    if before != now:
+        write_whole(path, now.encode())
+    # without a light: of an earlier version
+    return before == now or "\n" not in before or not (run / "checkpoints").is_dir()
 
 
 def read_light(run: Path) -> str | None:
