@@ -25,7 +25,6 @@ from jaxtyping import Array, Bool, Float, Int
 from experiments.baselines import ray_chunks
 from spnr_jax.config import (
     MATERIAL_CHANNELS,
-    LossConfig,
     NetworkConfig,
     OptimizerConfig,
     RenderOptions,
@@ -96,15 +95,12 @@ class PointNeRFConfig(NetworkConfig):
         ray_chunks.check_stride(self)
 
 
-SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
-
-
 def published_config(size: int) -> TrainConfig:
     """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU."""
     return TrainConfig(
         preset=f"point_nerf, {size} px, as published",
         model=PointNeRFConfig(image_resolution=size, pixel_stride={128: 4, 200: 5}[size]),
-        loss=SQUARES,
+        loss=ray_chunks.SQUARES,
         optimizer=OptimizerConfig(lr_generator=5e-4, warmup_steps=0, decay="exponential"),
         num_steps=1_000_000,
         batch_objects=1,
@@ -128,7 +124,7 @@ def point_nerf_tiny() -> TrainConfig:
             ray_chunk=1024,
             pixel_stride=4,
         ),
-        loss=SQUARES,
+        loss=ray_chunks.SQUARES,
         optimizer=OptimizerConfig(lr_generator=2e-3, warmup_steps=100, ema_decay=0.995),
         num_steps=1200,
         batch_objects=4,

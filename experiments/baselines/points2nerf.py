@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from experiments.baselines import ray_chunks
-from spnr_jax.config import LossConfig, Material, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
+from spnr_jax.config import Material, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
 from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
@@ -85,9 +85,6 @@ class Points2NeRFConfig(NetworkConfig):
         ray_chunks.check_stride(self)
 
 
-SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
-
-
 def published_config(size: int) -> TrainConfig:
     """The published training at 128 (ABO) or 200 pixels (ShapeNet), 1024 or 1600 rays a step; meant for one GPU.
 
@@ -96,7 +93,7 @@ def published_config(size: int) -> TrainConfig:
     return TrainConfig(
         preset=f"points2nerf, {size} px, as published",
         model=Points2NeRFConfig(image_resolution=size, pixel_stride={128: 4, 200: 5}[size]),
-        loss=SQUARES,
+        loss=ray_chunks.SQUARES,
         optimizer=OptimizerConfig(
             lr_generator=5e-5, warmup_steps=0, algorithm="radam", decay="exponential", final_lr_scale=0.135
         ),
@@ -130,7 +127,7 @@ def points2nerf_tiny() -> TrainConfig:
             image_resolution=64,
             pixel_stride=4,
         ),
-        loss=SQUARES,
+        loss=ray_chunks.SQUARES,
         optimizer=OptimizerConfig(lr_generator=3e-3, warmup_steps=30, ema_decay=0.995, algorithm="radam"),
         num_steps=1200,
         batch_objects=4,

@@ -6,8 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from spnr_jax.config import LossConfig
 from spnr_jax.errors import require
 from spnr_jax.kernels.records import Batch, Camera, Key, Rendering
+
+SQUARES = LossConfig(l1_weight=0.0, mse_weight=1.0, adversarial_weight=0.0)
 
 
 def render(module: Any, scene: Any, camera: Camera, rays: Any, chunk: int) -> Rendering:

@@ -77,7 +77,8 @@ def record_data(run: Path, dataset: Dataset) -> bool:
 def read_light(run: Path) -> str | None:
     """Name of the light of the data set that a run was last trained on, None if it is not recorded."""
     path = run / "data.txt"
-    return path.read_text().partition("\n")[2].strip() or None if path.is_file() else None
+    lines = path.read_text().splitlines() if path.is_file() else []
+    return lines[1] if len(lines) > 1 else None
 
 
 def read_config(run: Path | str) -> TrainConfig:

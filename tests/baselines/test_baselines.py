@@ -37,8 +37,8 @@ def trained(config, stride=None, **changes):
 
 TRAININGS = {
     "npbg": trained(RASTERS),
-    "point_nerf": trained(POINT_NERF, stride=3, loss=point_nerf.SQUARES),
-    "points2nerf": trained(HYPER, stride=4, loss=points2nerf.SQUARES, optimizer=RADAM),
+    "point_nerf": trained(POINT_NERF, stride=3, loss=ray_chunks.SQUARES),
+    "points2nerf": trained(HYPER, stride=4, loss=ray_chunks.SQUARES, optimizer=RADAM),
 }
 
 
