@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from data_gen.render.variant import mitsuba_module
-from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import Asset, Part
 from spnr_jax.formats.data_sets import on_white
 from spnr_jax.kernels.imaging import linear_to_srgb
@@ -151,8 +150,6 @@ def mitsuba_mesh(part: Part, name: str):
 def principled(part: Part) -> dict:
     """The part's material as a description of Mitsuba's principled BSDF."""
     material = part.material
-    if part.colors is not None and np.ndim(material.base_color) == 3:
-        raise UserError("vertex colours on top of a base-colour texture cannot be rendered; bake them into one")
     if part.colors is not None:
         base_color: dict = {"type": "mesh_attribute", "name": "vertex_color"}
     elif np.ndim(material.base_color) == 3:

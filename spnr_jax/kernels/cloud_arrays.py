@@ -97,8 +97,6 @@ def bucket(count: int, least: int = SMALLEST_BUCKET) -> int:
 
     `least` is a power of two.
     """
-    if count < 1:
-        raise UserError(f"a cloud needs at least 1 point, got {count}")
     return max(least, 1 << (count - 1).bit_length())
 
 

@@ -329,7 +329,6 @@ class Viewer:
     def __init__(
         self, model: Model, first: State, reading: dict[str, Any], host: str, port: int, reached_at: str | None = None
     ) -> None:
-        _check_free(host, port)
         self._model, self._first, self._reading = model, first, reading
         self._network = threading.Lock()
         self._browsers: dict[int, Browser] = {}

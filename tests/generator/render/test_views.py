@@ -5,7 +5,6 @@ import pytest
 from support.handmade import BLUE, GREEN, GREY, RED, WHITE_LIGHT, ball, box, checked_box_and_ball, plain
 
 from data_gen.render import views
-from spnr_jax.errors import UserError
 from spnr_jax.formats import data_sets, surface_points
 from spnr_jax.formats.assets import Asset
 from spnr_jax.kernels.imaging import srgb_to_linear
@@ -87,13 +86,6 @@ def test_condition_pixels_carry_the_reference_colour_and_hidden_points_leave_non
         np.testing.assert_array_equal(conditions[view, expected, :3], reference[expected])
         assert (conditions[view, ~expected] == 0).all()
         assert (images[view, expected, 3] > 0).mean() > 0.95
-
-
-def test_vertex_colours_on_a_texture_are_rejected_with_the_reason():
-    part = checked_box_and_ball().parts[0]
-    both = type(part)(**{**vars(part), "colors": np.ones_like(part.positions)})
-    with pytest.raises(UserError, match="vertex colours"):
-        views.build_scene(Asset(parts=(both,)), WHITE_LIGHT)
 
 
 def test_the_light_itself_is_not_in_the_picture_and_alpha_is_coverage():
