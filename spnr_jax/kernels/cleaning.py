@@ -26,12 +26,11 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from spnr_jax.errors import UserError
-from spnr_jax.kernels.cloud_arrays import check_cloud_kind, find_distinct, unit_means, voxel_keys
+from spnr_jax.kernels.cloud_arrays import Columns, check_cloud_kind, find_distinct, unit_means, voxel_keys
 from spnr_jax.kernels.records import PointCloud
 
 Strength = Literal["auto", "strong"]
 Clean = Literal["auto", "off", "strong"]
-Values = dict[str, np.ndarray]
 
 LEAST_POINTS = 100  # with fewer points, outliers cannot be told from the surface
 NEIGHBORS = 8  # whose mean distance is a point's score
@@ -78,7 +77,7 @@ class Cleaned(NamedTuple):
     """
 
     positions: Float[np.ndarray, "left 3"]
-    values: Values
+    values: Columns
     lines: list[str]
     noise: float
 
@@ -103,7 +102,7 @@ def clean(cloud: PointCloud, strength: Strength = "auto") -> tuple[PointCloud, l
     return dataclasses.replace(cloud, mask=np.ones(len(positions), bool), **values), lines
 
 
-def clean_columns(positions: Float[np.ndarray, "points 3"], values: Values, strength: Strength = "auto") -> Cleaned:
+def clean_columns(positions: Float[np.ndarray, "points 3"], values: Columns, strength: Strength = "auto") -> Cleaned:
     """Points and other columns (points, ...) without outliers, and averaged; clean columns are not copied."""
     lines = []
     outlier = find_outliers(positions, strength)
@@ -217,8 +216,8 @@ def _measure_heights(near: np.ndarray) -> np.ndarray:
 
 
 def denoise(
-    positions: Float[np.ndarray, "points 3"], values: Values, sigma: float, spacing: float
-) -> tuple[Float[np.ndarray, "moved 3"], Values]:
+    positions: Float[np.ndarray, "points 3"], values: Columns, sigma: float, spacing: float
+) -> tuple[Float[np.ndarray, "moved 3"], Columns]:
     """Points moved to remove noise of this standard deviation, at most MOST_MOVED, and the local means of their values.
 
     Normals keep unit length, or are 0 where they contradict each other.
@@ -274,7 +273,7 @@ def _denoise_step(
     return moved + towards[:, :1] * axes[..., 0]
 
 
-def _local_means(positions: np.ndarray, columns: Values, radius: float) -> Values:
+def _local_means(positions: np.ndarray, columns: Columns, radius: float) -> Columns:
     """Local means of the columns, over the points around each position."""
     tree = cKDTree(positions)
     pieces = [_query_neighbors(positions[i : i + ROWS], tree, radius, MEANT) for i in range(0, len(positions), ROWS)]

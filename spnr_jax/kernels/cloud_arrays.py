@@ -24,6 +24,7 @@ from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels.numerics import array_namespace
 from spnr_jax.kernels.records import AnyArray, PointCloud
 
+Columns = dict[str, np.ndarray]  # arrays of a cloud by name, (points, ...)
 SMALLEST_BUCKET = 512
 NEEDED = {x.name for x in fields(PointCloud) if x.default is MISSING}  # fields of a cloud that are never None
 VECTORS = ("positions", "base_color", "normals")  # fields of a cloud with three numbers a point
@@ -150,7 +151,6 @@ def make_cloud(
 # --- repeated points --------------------------------------------------------------------------------------------------
 
 
-Values = dict[str, np.ndarray]
 NEAR = 1e-3  # times the median spacing
 AROUND, SAMPLE = 128, 1024  # neighbours that determine the spacing; points at which it is estimated
 FEW = 8  # distinct points: with fewer, the spacing is meaningless
@@ -160,7 +160,7 @@ LINE = 1e-13  # largest variance of a line across it, as a share of that along i
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
-def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Values) -> tuple[np.ndarray, Values, int]:
+def merge_repeats(positions: Float[np.ndarray, "points 3"], values: Columns) -> tuple[np.ndarray, Columns, int]:
     """The points without repeats, the means of their other columns (points, ...), and the number of merged points.
 
     Of merged points, the first keeps its position.  A cloud without repeats is returned unchanged.
@@ -250,8 +250,6 @@ def require_surface(positions: Float[np.ndarray, "points 3"], before: int) -> No
 
 # --- thinning ---------------------------------------------------------------------------------------------------------
 
-
-Columns = dict[str, np.ndarray]
 
 THINNING = 16  # farthest-point sampling starts from at most this many times the number of points to keep
 INNER = (0.05, 0.95)  # quantiles along each axis that define the extent of a cloud: outliers do not count

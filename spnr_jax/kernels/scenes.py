@@ -32,12 +32,11 @@ LEAST_PLANE = 0.1  # least share of the area of a plane
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plane:
-    """normal . position = offset, `share` of the area within `thickness` of it."""
+    """Points within `thickness` of normal . position = offset."""
 
     normal: Float[np.ndarray, "3"]
     offset: float
     thickness: float
-    share: float
 
     def holds(self, positions: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
         """True for points that belong to it."""
@@ -169,5 +168,5 @@ def find_dominant_plane(positions: Float[np.ndarray, "points 3"], seed: int = 0)
     heights = np.abs(evenly @ normal - offset)
     deviation = float(np.sqrt(np.mean(heights[heights < 2 * CLOSE * voxel] ** 2)))
     thickness = float(np.clip(THICK * deviation, CLOSE * voxel, voxel))
-    share = float(np.mean(heights <= thickness))
-    return None if share < LEAST_PLANE else Plane(normal=normal, offset=offset, thickness=thickness, share=share)
+    found = Plane(normal=normal, offset=offset, thickness=thickness)
+    return found if np.mean(heights <= thickness) >= LEAST_PLANE else None
