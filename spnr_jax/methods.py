@@ -191,11 +191,6 @@ def method_of(config: NetworkConfig) -> Method:
     return found
 
 
-def label_of(name: str) -> str:
-    """The name of a method in tables and pictures."""
-    return METHODS[name].label if name in METHODS and METHODS[name].label else name
-
-
 def to_dict(config: TrainConfig) -> dict:
     """A training config as a nested dict, with the method of its network and the file that registered it."""
     values, source = dataclasses.asdict(config), method_of(config.model).source

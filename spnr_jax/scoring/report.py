@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spnr_jax.formats.images import depth_image, png_url, template, write_whole
-from spnr_jax.methods import label_of, to_dict
+from spnr_jax.methods import METHODS, to_dict
 from spnr_jax.scoring.evaluation import TRIVIAL, Evaluation, ObjectResult, Pictures, median_view
 from spnr_jax.scoring.picture_scores import NO_LPIPS
 
@@ -109,7 +109,7 @@ def difference(found: Mapping | None, metric: str) -> Cell:
 
 def label(method: str) -> str:
     """Name of a method in tables and pictures."""
-    return OTHERS.get(method) or label_of(method)
+    return OTHERS.get(method) or (method in METHODS and METHODS[method].label) or method
 
 
 COUNTS = {"objects": "Objects", "views": "Views", "cpsnr_views": "cPSNR views"}

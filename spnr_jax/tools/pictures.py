@@ -138,7 +138,8 @@ def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Cal
     else:
         cameras += [_camera(ready, turn, options) for turn in turns]
         lights += [ready.light] * len(turns)
-    views = _draw(ready, cameras, lights, options)
+    drawn = zip(cameras, lights, ready.model.render_each(ready.volume, cameras, options.quality, lights), strict=True)
+    views = (put_background(options.background, rendering, camera, light) for camera, light, rendering in drawn)
     for i, (camera, rendering) in enumerate(zip(stills, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", rendering, camera, ready.volume, options)
     if stills:
@@ -156,15 +157,6 @@ def _turns(count: int) -> list[float]:
 
 def _camera(ready: PreparedObject, azimuth: float, options: Render) -> Camera:
     return ready.model.camera(ready.volume, azimuth, options.elevation, options.resolution)
-
-
-def _draw(
-    ready: PreparedObject, cameras: list[Camera], lights: list[Light | None], options: Render
-) -> Iterator[Rendering]:
-    """Renderings of the views, one after the other, in front of their background."""
-    renderings = ready.model.render_each(ready.volume, cameras, options.quality, lights)
-    for camera, light, rendering in zip(cameras, lights, renderings, strict=True):
-        yield put_background(options.background, rendering, camera, light)
 
 
 def _write_still(stem: str, rendering: Rendering, camera: Camera, volume: Encoded, options: Render) -> str:
