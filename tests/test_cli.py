@@ -105,7 +105,6 @@ REFUSED = [  # command, what its line says
     ("export RUN --sun 40 30", "--sun is for --splats"),
     ("export RUN --fitting-views 8", "--fitting-views is for --splats"),
     ("export RUN --up z", "--up is for --splats"),
-    ("export ball.xyz --splats out.ply --quality draft", "--quality is not for --splats"),
     ("export ball.xyz --splats out.ply --out x", "--out is not for --splats"),
     (f"{LIT} --views 0 --turntable none", "--views 0 --turntable none: nothing is left to draw"),
     (f"{LIT} --outputs", "--outputs"),

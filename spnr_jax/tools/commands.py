@@ -262,8 +262,6 @@ class Export:
     cloud (default: 16,384)."""
     resolution: int | None = None
     """Pixels along each side (default: the size of the training)."""
-    quality: Quality = "best"
-    """As for `spnr render`."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
     """Target platforms."""
 
@@ -273,7 +271,7 @@ class Export:
         changed = changed_options(self)
         of_cloud = [name for name in changed if name in ("--network", "--up", "--clean")]
         of_cloud += [*changed_options(self.lighting), *changed_options(self.making)]
-        of_network = [name for name in changed if name in ("--out", "--resolution", "--quality", "--platforms")]
+        of_network = [name for name in changed if name in ("--out", "--resolution", "--platforms")]
         if wrong := of_cloud[:1] if self.splats is None else of_network[:1]:
             what = "is for --splats FILE, which is not given" if self.splats is None else "is not for --splats"
             raise UserError(f"{wrong[0]} {what}; leave it out")

@@ -42,7 +42,7 @@ from jax import export
 from jaxtyping import Array, Bool, Float, Int
 from PIL import Image
 
-from spnr_jax.config import Quality, SurfelConfig
+from spnr_jax.config import SurfelConfig
 from spnr_jax.errors import UserError, require
 from spnr_jax.formats import images
 from spnr_jax.formats.array_files import pack_arrays
@@ -185,7 +185,7 @@ def export_network(options: Export) -> str:
     points, size = options.num_points or 1024, options.resolution
     functions = {
         "encode": export_encode(model, num_points=points, platforms=where),
-        "render": export_render(model, resolution=size, quality=options.quality, num_points=points, platforms=where),
+        "render": export_render(model, resolution=size, num_points=points, platforms=where),
     }
     weights.write_weights(out / "weights.npz", trained)
     for path in weights.own_companions(trained.config.model, weights.locate(options.run)).values():
@@ -214,7 +214,6 @@ def export_render(
     model: Model,
     *,
     resolution: int | None = None,
-    quality: Quality = "best",
     num_points: int = 1024,
     plan: Plan | None = None,
     platforms: Sequence[str] | None = None,
@@ -228,10 +227,7 @@ def export_render(
     _check_exportable(model)
     size = model.config.image_resolution if resolution is None else resolution
     require_drawable(size, "resolution")
-    if quality == "balanced":
-        raise UserError("balanced draws fewer pixels and enlarges them; export a smaller resolution")
-    params = None if quality == "draft" else model.params
-    draw = partial(render_arrays, params, size=size, plan=plan or make_plan(model, num_points, size))
+    draw = partial(render_arrays, model.params, size=size, plan=plan or make_plan(model, num_points, size))
     volume = jax.eval_shape(partial(encode_arrays, model.params), cloud_shapes(num_points))
     camera = {"cam_to_world": _floats(3, 4), "intrinsics": _floats(3, 3)}
     light = {"tables": _floats(7, lighting.HEIGHT, lighting.WIDTH, 3)}
@@ -276,9 +272,7 @@ def encode_arrays(params: dict, cloud: Arrays) -> Arrays:
     return dict(to_state_dict(surfel_renderer.encode(params, points, near)))
 
 
-def render_arrays(
-    params: dict | None, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan
-) -> Arrays:
+def render_arrays(params: dict, volume: Arrays, camera: Arrays, light: Arrays, *, size: int, plan: Plan) -> Arrays:
     """The picture of a scene as a dict of arrays; pure."""
     scene = SurfelScene(**volume | {"surfels": Surfels(**volume["surfels"])})
     view = Camera(**camera, height=size, width=size)

@@ -57,7 +57,6 @@ def pictures_of_a_stranger(folder, points, camera, *lights):
         (lambda model: export.export_encode(model, num_points=0), "num_points must be at least 1, got 0"),
         (lambda model: export.export_render(model, resolution=18), "multiple of 4 from 16 to 16384, got 18"),
         (lambda model: export.load_exported(b"PK\x03\x04 a zip"), "not a function that JAX exported"),
-        (lambda model: export.export_render(model, quality="balanced"), "export a smaller resolution"),
     ],
 )
 def test_what_cannot_be_exported_or_loaded_is_refused_in_one_line(make, message):
