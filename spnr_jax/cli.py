@@ -42,10 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command with all its options.
-
-    Two are read before the others: --methods, which adds methods and presets, and --preset, which gives the defaults.
-    """
+    """The command with all its options; --methods, which adds some, and --preset, their defaults, are read first."""
     source, arguments = take_option(arguments, "--methods")
     if source is not None:
         runtime.hide_false_alarms()  # it may import JAX

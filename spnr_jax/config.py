@@ -1,13 +1,5 @@
 """All numbers of networks, training and rendering, as frozen dataclasses; `presets.py` holds whole training configs.
 
-    EncoderConfig   points to a volume: the first part of the paper's network
-    PaperConfig     the paper's network             method/paper_method.py
-    SurfelConfig    the surfel network              method/surfel_method.py
-    TrainConfig     a training run: network, losses, optimiser, batches
-    Schedule        how often the training loop logs, previews and saves
-    RenderOptions   sampling and memory of a rendering
-    Cut             what is cut out of a scene before it is drawn
-
 Configs are hashable, so they can be static arguments of jit.  All numbers are finite and at least 0.  A wrong value
 raises ValueError when the config is made; the message names the field and the value.  Values marked [paper] are in the
 paper's supplement; the others are our choice.
@@ -161,7 +153,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig(NetworkConfig):
-    """Sizes of the paper's network: encoder, sampling, field, upsampler."""
+    """Sizes of the paper's network (`method/paper_method.py`): encoder, sampling, field, upsampler."""
 
     method: ClassVar[str] = "paper"
     has_discriminator: ClassVar[bool] = True

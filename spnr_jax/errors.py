@@ -129,10 +129,7 @@ def spnr() -> None:
 
 
 def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
-    """Exit code of the work; an error that the user can fix is one line on stderr and code 2, a stop is code 130.
-
-    With `debug`, the call stack is printed before that line.
-    """
+    """Exit code of the work: 130 for a stop; 2, with one line on stderr, for an error that the user can fix."""
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot print stops no picture
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -94,10 +94,7 @@ def strip(cloud: PointCloud) -> PointCloud:
 
 
 def bucket(count: int, least: int = SMALLEST_BUCKET) -> int:
-    """The smallest of `least`, 2 least, 4 least, ... that is not below `count`: few sizes, so few compilations.
-
-    `least` is a power of two.
-    """
+    """`least`, a power of two, doubled until it holds `count`: few sizes, so few compilations."""
     return max(least, 1 << (count - 1).bit_length())
 
 

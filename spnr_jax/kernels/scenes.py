@@ -112,10 +112,7 @@ def choose_voxel_side(positions: Float[np.ndarray, "points 3"]) -> float:
 
 
 def find_clusters(positions: Float[np.ndarray, "points 3"], voxel: float | None = None) -> Int[np.ndarray, " points"]:
-    """The cluster index of each point, 0 for the largest; `voxel` is `choose_voxel_side` by default.
-
-    Ties in size are broken by the order of the clusters' first points.
-    """
+    """The cluster of each point, 0 for the largest; of equal ones, that of the first point comes first."""
     x, y, z = (_slices(axis, voxel or choose_voxel_side(positions)) for axis in positions.T)
     deep, wide = int(z.max()) + 2, int(y.max()) + 2
     keys, first, rows = np.unique((x * wide + y) * deep + z, return_index=True, return_inverse=True)

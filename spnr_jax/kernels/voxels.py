@@ -152,10 +152,7 @@ blend_rows.defvjp(_blend_fwd, _blend_bwd)
 def locate(
     positions: Float[Array, "*batch 3"], resolution: int
 ) -> tuple[Int[Array, "*batch 3"], Float[Array, "*batch 3"]]:
-    """Voxel (x, y, z) of each position, clamped to the grid, and the offset from its centre in voxels.
-
-    A position on the far face of the box belongs to the last voxel.
-    """
+    """Voxel (x, y, z) of each position, clamped to the grid, and the offset from its centre in voxels."""
     cell = voxel_of(positions, resolution)
     return cell, (positions + 1) * (0.5 * resolution) - cell - 0.5
 

@@ -43,10 +43,7 @@ from spnr_jax.surfels.sides import choose_cell, choose_grid, compute_visibility
 
 
 class PointColumns(NamedTuple):
-    """All points of a cloud as columns, zeros for padding, and the indices of their neighbors.
-
-    `oriented` says which points came with an oriented normal.
-    """
+    """All points of a cloud as columns, zeros for padding; their neighbors; and which came with an oriented normal."""
 
     neighbors: Int[Array, "k points"]
     mask: Bool[Array, " points"]

@@ -223,10 +223,7 @@ def add_reflected(cloud: PointCloud, surface: Surface, plane: Plane) -> PointClo
 def space_out(
     position: Float[np.ndarray, "n 3"], distance: Float[np.ndarray, " n"], least: float
 ) -> Int[np.ndarray, " kept"]:
-    """Greedy thinning: visits points by decreasing distance, keeps those farther than `least` from all kept ones.
-
-    Returns sorted indices.
-    """
+    """Sorted indices of the points kept: visited by decreasing distance, farther than `least` from all kept before."""
     near, free = cKDTree(position).query_ball_point(position, least), np.ones(len(position), bool)
     kept = np.zeros(len(position), bool)
     for point in np.argsort(-distance, kind="stable"):

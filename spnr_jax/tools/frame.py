@@ -118,10 +118,7 @@ def relight(state: State, lighting: Lighting) -> State:
 
 
 def draw(model: Model, state: State, moving: bool) -> np.ndarray | None:
-    """The canvas, uint8; None until the browser has sent its camera.
-
-    Moving: `draft`, at the network's own size.  At rest: the chosen quality.
-    """
+    """The canvas, uint8: a `draft` while it moves; None until the browser has sent its camera."""
     if (view := state.view) is None:
         return None
     named = qualities(model)

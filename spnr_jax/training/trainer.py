@@ -205,10 +205,7 @@ def preview(
     run: Path,
     light: Light | None = None,
 ) -> tuple[dict[str, float], np.ndarray]:
-    """PSNR of the averaged network on a few objects of validation, or else of training, and their preview.
-
-    The preview has references above renderings.
-    """
+    """PSNR of the averaged network on a few objects of validation, or else of training; references above renderings."""
     names = (dataset.splits["val"] or dataset.splits["train"])[:PREVIEWED]
     variables = programs.on_first_device(optimisation.averaged_variables(state))
     variables = add_companions(config.model, variables, run)
