@@ -108,7 +108,7 @@ def road_car(rng, style) -> list[Piece]:
     pieces += fittings(rng, trim, half, sill, belt, axles)
     pieces += wheels(rng, rubber, trim, radius, half, axles, thick=rng.uniform(0.05, 0.075) * chubby)
     if style in ("truck", "pickup"):
-        pieces += load(rng, style, second, trim, half, sill, belt, high, foot)
+        pieces += load(rng, style, second, trim, half, sill, belt, foot)
     if rng.random() < 0.12 and style in ("saloon", "estate", "van", "hatch"):
         sign = move(box((half * rng.uniform(0.5, 1.2), 0.025, 0.04), 0.006), y=high + 0.012, z=(foot[1] + foot[2]) / 2)
         pieces.append((trim, sign))
@@ -215,7 +215,7 @@ def wheels(rng, rubber, trim, radius, half, axles, thick) -> list[Piece]:
     return pieces
 
 
-def load(rng, style, paint, trim, half, sill, belt, high, foot) -> list[Piece]:
+def load(rng, style, paint, trim, half, sill, belt, foot) -> list[Piece]:
     """What stands behind the cab: an open bed, a box, a tank or a flat bed."""
     rear, front = -0.49, foot[0] - 0.01
     middle, long = (rear + front) / 2, front - rear

@@ -24,7 +24,7 @@ def upholstery(rng) -> finishes.Finish:
     return finishes.choose(rng, finishes.fabric, finishes.fabric, finishes.leather)
 
 
-def cushions(rng, count, width, thick, depth, roundness) -> Mesh:
+def cushions(count, width, thick, depth, roundness) -> Mesh:
     """Seat cushions side by side about x = z = 0, their under sides at y = 0."""
     each = width / count
     pad = superellipsoid((each * 1.01, thick, depth), roundness, 0.22, 10, 28)
@@ -72,14 +72,14 @@ def classic(rng) -> list[Piece]:
 
     pieces = [(cover, move(box((whole, base, depth + deep), 0.03, 3), y=foot + base / 2, z=-deep / 2))]
     count = seats if rng.random() < 0.75 else 1
-    pad = cushions(rng, count, inner, thick, depth * 1.02, roundness)
+    pad = cushions(count, inner, thick, depth * 1.02, roundness)
     pieces.append((second, move(pad, y=foot + base - 0.01, z=0.01)))
     tilt = rng.uniform(0, 12)
     rest = box((whole if rng.random() < 0.6 else inner, back + thick, deep * 0.8), deep * rng.uniform(0.1, 0.38), 3)
     rest = turn(move(rest, y=(back + thick) / 2), "x", -tilt)
     pieces.append((cover, move(rest, y=seat - thick - 0.02, z=-depth / 2 - deep * 0.5)))
     if rng.random() < 0.75:
-        pad = move(turn(cushions(rng, count, inner, back * 1.1, deep, 0.45), "x", -tilt - 4), y=seat - 0.02)
+        pad = move(turn(cushions(count, inner, back * 1.1, deep, 0.45), "x", -tilt - 4), y=seat - 0.02)
         pieces.append((second, move(pad, z=-depth / 2 + deep * 0.25)))
     if not armless:
         style = rng.choice(["box", "round", "scroll", "slope"])
@@ -120,8 +120,8 @@ def framed(rng) -> list[Piece]:
     bar = box((0.04, back + 0.1, 0.025))
     ladder += [move(bar, x, (back - 0.06) / 2) for x in np.linspace(-0.48, 0.48, seats + 1) * inner]
     rest = move(turn(merge(ladder), "x", -lean), y=seat, z=-depth / 2 + radius)
-    pad = cushions(rng, seats, inner, thick, depth * 0.9, rng.uniform(0.25, 0.45))
-    upright = turn(cushions(rng, seats, inner, back, thick, 0.4), "x", -lean)
+    pad = cushions(seats, inner, thick, depth * 0.9, rng.uniform(0.25, 0.45))
+    upright = turn(cushions(seats, inner, back, thick, 0.4), "x", -lean)
     pieces = [(body, merge([legs, rests, *rails, *slats, rest])), (cover, move(pad, y=seat + 0.005))]
     return [*pieces, (cover, move(upright, y=seat + thick * 0.8, z=-depth / 2 + thick * 0.6))]
 
@@ -154,7 +154,7 @@ def bench(rng) -> list[Piece]:
     width, depth = rng.uniform(0.9, 2.0), rng.uniform(0.45, 0.8)
     seat, thick = rng.uniform(0.36, 0.46), rng.uniform(0.08, 0.18)
     parts = int(rng.integers(1, 5))
-    pad = cushions(rng, parts, width, thick, depth, rng.uniform(0.2, 0.5))
+    pad = cushions(parts, width, thick, depth, rng.uniform(0.2, 0.5))
     frame = move(box((width * 0.99, 0.06, depth * 0.95), 0.01, 3), y=seat - thick - 0.02)
     leg = leg_style(rng, rng.uniform(0.018, 0.035))
     legs = four_legs(leg, width * 0.88, depth * 0.8, seat - thick, rng.uniform(0, 0.06))
@@ -168,7 +168,7 @@ def bench(rng) -> list[Piece]:
         pieces += [(cover, move(roll, s * (width / 2 - radius - 0.02))) for s in ends]
     if kind == "backs":
         high = rng.uniform(0.3, 0.45)
-        upright = turn(cushions(rng, parts, width, high, thick * 0.8, 0.35), "x", -rng.uniform(4, 14))
+        upright = turn(cushions(parts, width, high, thick * 0.8, 0.35), "x", -rng.uniform(4, 14))
         pieces.append((cover, move(upright, y=seat - 0.03, z=-depth / 2 + thick * 0.3)))
         post = box((0.03, high, 0.02))
         posts = [move(post, x, seat + high * 0.3, -depth / 2 - 0.02) for x in (-width * 0.35, width * 0.35)]
