@@ -75,16 +75,6 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions:
-    """Rendering options of a ray-marching network; its sizes and weights do not change."""
-
-    sampling: SamplingConfig | None = None
-    """Samples per ray; None: as in training."""
-    block: int | None = None
-    """Rays rendered at once, which bounds the memory; None: a default that suits the network."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
     """Sizes of PointNet and 3D U-Net, which encode points to a volume (`nn/paper_layers.py`)."""
 

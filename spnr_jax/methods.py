@@ -46,7 +46,7 @@ class Method:
     config: type[NetworkConfig]
     """The config class of the network; its `method` is the name of the method."""
     network: Function | None = None
-    """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud,
+    """(config) -> Linen module with `encode(cloud, train)`, `render(scene, camera)` and `__call__(cloud,
     camera, key, train)`.  Values that it sows into "losses" are added to the loss."""
     init: Function = lazy("spnr_jax.method.inference:init")
     """(key, config) -> fresh variables {"params", "batch_stats"}."""

@@ -24,7 +24,6 @@ from spnr_jax.config import (
     LossConfig,
     NetworkConfig,
     OptimizerConfig,
-    RenderOptions,
     TrainConfig,
     check,
 )
@@ -199,8 +198,8 @@ class NPBG(nn.Module):
         """The cloud."""
         return cloud
 
-    def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
-        """Views of each cloud; nothing is random, and there is nothing to choose."""
+    def render(self, cloud: PointCloud, camera: Camera) -> Rendering:
+        """Views of each cloud; nothing is random."""
         scales = range(len(self.config.encoder_widths))
         rasters, distances = zip(*(self.rasters(cloud, camera, 2**i) for i in scales), strict=True)
         flat = [x.reshape(-1, *x.shape[2:]) for x in rasters]

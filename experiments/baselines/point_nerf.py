@@ -27,7 +27,6 @@ from spnr_jax.config import (
     MATERIAL_CHANNELS,
     NetworkConfig,
     OptimizerConfig,
-    RenderOptions,
     TrainConfig,
     check,
 )
@@ -305,8 +304,8 @@ class PointNeRF(nn.Module):
         cloud = jax.tree.map(jnp.asarray, cloud)
         return split_objects(own, self.weights, *jax.lax.stop_gradient((cloud, (view, distances, far, hit))))
 
-    def render(self, cloud: PointCloud, camera: Camera, options: RenderOptions | None = None) -> Rendering:
-        """Views of each cloud, some rays at a time; there is nothing to choose."""
+    def render(self, cloud: PointCloud, camera: Camera) -> Rendering:
+        """Views of each cloud, some rays at a time."""
         return ray_chunks.render(self, cloud, camera, self.rays(camera), self.config.ray_chunk)
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:

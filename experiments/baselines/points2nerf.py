@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from experiments.baselines import ray_chunks
-from spnr_jax.config import Material, NetworkConfig, OptimizerConfig, RenderOptions, TrainConfig, check
+from spnr_jax.config import Material, NetworkConfig, OptimizerConfig, TrainConfig, check
 from spnr_jax.errors import UserError, require
 from spnr_jax.kernels import cameras, compositing, sampling
 from spnr_jax.kernels.imaging import WHITE
@@ -268,8 +268,8 @@ class Points2NeRF(nn.Module):
         """Each object's NeRF from the mean of its code."""
         return self.weights(self.code(cloud)[0])
 
-    def render(self, weights: Weights, camera: Camera, options: RenderOptions | None = None) -> Rendering:
-        """Views of encoded objects, some rays at a time; there is nothing to choose."""
+    def render(self, weights: Weights, camera: Camera) -> Rendering:
+        """Views of encoded objects, some rays at a time."""
         return ray_chunks.render(self, weights, camera, cameras.view_rays(camera), self.config.ray_chunk)
 
     def render_rays(

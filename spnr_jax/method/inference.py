@@ -4,7 +4,7 @@
     loss                         loss of a training batch; pure
     encode_object, render_each   one object, compiled: for the handle (model.py), scores and the viewer
 
-The module has `encode(cloud, train)`, `render(scene, camera, options)` and `__call__(cloud, camera, key, train)`.
+The module has `encode(cloud, train)`, `render(scene, camera)` and `__call__(cloud, camera, key, train)`.
 Values sown into the collection "losses" are added to the loss.
 """
 
@@ -18,15 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.config import NetworkConfig, RenderOptions, TrainConfig
+from spnr_jax.config import NetworkConfig, TrainConfig
 from spnr_jax.devices.runtime import QUICK
 from spnr_jax.errors import UserError, check_kind
 from spnr_jax.kernels import cameras, cloud_arrays, losses
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.records import Batch, Camera, Key, Light, PointCloud, Rendering, Volume
 from spnr_jax.methods import Outcome, network
-
-IN_BLOCKS = RenderOptions(block=1024)  # rays through all the box at once: about 80 MB at 128 samples
 
 
 def init(key: Key, config: NetworkConfig) -> dict:
@@ -50,11 +48,9 @@ def encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any:
     return network(config).bind(variables).encode(cloud)
 
 
-def render(
-    variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig, options: RenderOptions | None = None
-) -> Rendering:
+def render(variables: dict, scene: Any, camera: Camera, *, config: NetworkConfig) -> Rendering:
     """Views of encoded scenes; without jitter, each sample lies in the middle of its stratum."""
-    return network(config).bind(variables).render(scene, camera, options or IN_BLOCKS)
+    return network(config).bind(variables).render(scene, camera)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
@@ -123,18 +119,17 @@ def render_each(
     lights: Sequence[Light | None],
     *,
     config: NetworkConfig,
-    quality: str = "trained",
-    options: RenderOptions | None = None,
+    quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other.  UserError for a light, or for odd sizes if the network doubles the resolution."""
     check_kind(volume, Volume, "render: expected a volume of this network's Model.encode")
-    del quality  # these networks have one quality; others choose theirs through `options`
+    del quality  # these networks have one
     for view, light in zip(views, lights, strict=True):
         if light is not None:
             raise UserError("this network knows the light of its training alone; give no light")
         if config.upsamples and (view.height % 2 or view.width % 2):
             raise UserError(f"this network doubles its pictures: {view.width} x {view.height} pixels must be even")
-        yield _render(variables, volume.scene, volume.centre, volume.scale, view, config=config, options=options)
+        yield _render(variables, volume.scene, volume.centre, volume.scale, view, config=config)
 
 
 # Compiled as a whole: outside of jit, each operation would be compiled alone, 30 ms each at the first call.
@@ -148,7 +143,7 @@ def _encode(variables: dict, cloud: PointCloud, *, config: NetworkConfig) -> Any
     return jax.tree.map(lambda x: x[0], scene)
 
 
-@partial(jax.jit, static_argnames=("config", "options"))
+@partial(jax.jit, static_argnames="config")
 def _render(
     variables: dict,
     scene: Any,
@@ -157,10 +152,9 @@ def _render(
     camera: Camera,
     *,
     config: NetworkConfig,
-    options: RenderOptions | None,
 ) -> Rendering:
     """One view; depth in the cloud's units."""
     scene, inside = jax.tree.map(lambda x: x[None], (scene, cameras.move_into_box(camera, centre, scale)))
-    rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config, options=options)
+    rendering = render(variables, scene, jax.tree.map(lambda x: x[None], inside), config=config)
     rendering = dataclasses.replace(rendering, depth=rendering.depth / scale)
     return jax.tree.map(lambda x: x[0, 0], rendering)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from spnr_jax.config import PaperConfig, RenderOptions, SamplingConfig, TrainConfig
+from spnr_jax.config import PaperConfig, SamplingConfig, TrainConfig
 from spnr_jax.devices.programs import split_objects
 from spnr_jax.kernels import cameras, compositing, sampling, voxels
 from spnr_jax.kernels.imaging import WHITE, resize_bilinear
@@ -36,6 +36,7 @@ from spnr_jax.nn.paper_layers import Discriminator, Encoder, RadianceField, Upsa
 SAMPLES = {"draft": 0.25, "balanced": 0.5, "best": 1.0}  # share of the samples per ray in training
 REACH_QUERIES = 4096  # points at which the spacing is measured
 REACH_PER_SPACING = 1.6  # the smallest reach that loses nothing from 128 to 4096 points, docs/lab/cpu_forms.md
+WHOLE_BLOCK = 1024  # rays through all the box that are rendered at once: about 80 MB at 128 samples
 RAY_BLOCK = 256  # rays near points that are rendered at once
 CPU_BLOCK = 64  # the same on a CPU outside of training: what a block reads stays in the first-level cache
 HIT_BLOCK = 2**14  # rays that are tested at once for whether they hit anything
@@ -87,13 +88,11 @@ class PaperNetwork(nn.Module):
         occupied = jax.vmap(partial(voxels.mark_occupied, resolution=self.config.encoder.volume_resolution))
         return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
 
-    def render(
-        self, scene: Scene, camera: Camera, options: RenderOptions | None = None, key: Key | None = None
-    ) -> Rendering:
-        """Views of encoded objects; the camera's size is that of the image.  A key jitters the samples (training)."""
-        options = options or RenderOptions()
-        samples = options.sampling or self.config.sampling
-        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, options.block, key))
+    def render(self, scene: Scene, camera: Camera, block: int | None = None) -> Rendering:
+        """Views of encoded objects, `block` rays at a time; the camera's size is that of the image."""
+        samples = self.config.sampling
+        block = block or (None if samples.reach else WHOLE_BLOCK)
+        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, block, None))
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -132,8 +131,9 @@ class PaperNetwork(nn.Module):
         )
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
-        """Views of each cloud from its cameras."""
-        return self.render(self.encode(cloud, train), camera, key=key)
+        """Views of each cloud from its cameras, all rays at once.  A key jitters the samples (training)."""
+        scene, samples = self.encode(cloud, train), self.config.sampling
+        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, None, key))
 
 
 # --- rays -------------------------------------------------------------------------------------------------------------
@@ -283,17 +283,17 @@ def render_each(
     quality: str,
 ) -> Iterator[Rendering]:
     """Views one after the other, with the number of samples of a quality level."""
-    options = choose_options(config, quality, volume.reach)
-    return inference.render_each(variables, volume, views, lights, config=config, options=options)
+    config = choose_samples(config, quality, volume.reach)
+    return inference.render_each(variables, volume, views, lights, config=config, quality=quality)
 
 
-def choose_options(config: PaperConfig, quality: str, reach: int) -> RenderOptions | None:
-    """The rendering options of a quality level, with samples only within `reach` voxels of points."""
+def choose_samples(config: PaperConfig, quality: str, reach: int) -> PaperConfig:
+    """The network with the samples of a quality level, which lie only within `reach` voxels of points."""
     if quality == "trained":
-        return None
+        return config
     counts = config.sampling
     samples = max(round(SAMPLES[quality] * (counts.num_coarse + counts.num_fine)), 1)
-    return RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
+    return dataclasses.replace(config, sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=reach))
 
 
 def discriminator(config: TrainConfig) -> Discriminator:

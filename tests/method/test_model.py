@@ -10,7 +10,7 @@ from support.laws import close
 from support.surfel_clouds import cloud
 
 import spnr_jax
-from spnr_jax.config import RenderOptions, SamplingConfig
+from spnr_jax.config import SamplingConfig
 from spnr_jax.formats import data_sets
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import LARGEST_REACH, Volume
@@ -94,8 +94,8 @@ class TestQuality:
     @pytest.mark.parametrize(("quality", "samples"), [("draft", 2), ("balanced", 4), ("best", 8), ("trained", None)])
     def test_a_quality_is_a_share_of_the_samples_near_the_points_or_what_the_training_took(self, quality, samples):
         config = dataclasses.replace(tiny_dataset.CONFIG.model, sampling=SamplingConfig(num_coarse=4, num_fine=4))
-        expected = samples and RenderOptions(sampling=SamplingConfig(num_coarse=samples, num_fine=0, reach=3))
-        assert paper_method.choose_options(config, quality, 3) == expected
+        expected = SamplingConfig(num_coarse=samples, num_fine=0, reach=3) if samples else config.sampling
+        assert paper_method.choose_samples(config, quality, 3) == dataclasses.replace(config, sampling=expected)
 
     def test_reach_follows_the_distance_between_the_points(self):
         grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)  # a quarter apart

@@ -11,11 +11,11 @@ from support import tiny_model
 from support.laws import close, same_bits
 from support.tiny_model import NUM_POINTS, camera, cloud
 
-from spnr_jax.config import MATERIAL_CHANNELS, RenderOptions
+from spnr_jax.config import MATERIAL_CHANNELS
 from spnr_jax.kernels import cameras, sampling, voxels
 from spnr_jax.kernels.cameras import intersect_box
 from spnr_jax.kernels.records import Rays, Scene
-from spnr_jax.method import inference
+from spnr_jax.method import inference, paper_method
 from spnr_jax.nn.paper_layers import Encoder
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
@@ -37,8 +37,8 @@ def encoded(variables):
     return encode(variables, cloud())
 
 
-def render(variables, volume, camera, **options):
-    return tiny_model.render(variables, volume, camera, config=CONFIG, **options)
+def render(variables, volume, camera):
+    return tiny_model.render(variables, volume, camera, config=CONFIG)
 
 
 @jax.jit
@@ -109,9 +109,10 @@ class TestViews:
     def test_rays_do_not_know_their_block(self, variables):
         """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-        whole, part = (render(variables, volume, camera(), **x) for x in ({}, {"options": RenderOptions(block=7)}))
-        close(part, whole, rtol=1e-6, atol=1e-6)
-        same_bits(render(variables, volume, camera(), options=RenderOptions(block=7)), part)
+        in_sevens = jax.jit(lambda *given: inference.network(CONFIG).bind(variables).render(*given, block=7))
+        part = in_sevens(volume, camera())
+        close(part, render(variables, volume, camera()), rtol=1e-6, atol=1e-6)
+        same_bits(in_sevens(volume, camera()), part)
 
     def test_samples_of_rays_that_graze_an_edge_stay_in_the_box(self, variables):
         """Their way through it is shorter than the rounding of a position, and outside there would be nothing."""
@@ -191,8 +192,9 @@ class TestEmptySpace:
 
         @partial(jax.jit, static_argnames="block")
         def jittered(key, block):
-            options = RenderOptions(block=block)
-            return inference.network(NEAR).bind(variables).render(encoded, generic, options, key)
+            network = inference.network(NEAR).bind(variables)
+            drawn = paper_method.render_rays(network, encoded, network.rays(generic), NEAR.sampling, block, key)
+            return network.decode_images(generic, drawn)
 
         few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
         close(few, many, atol=1e-5)

@@ -51,7 +51,7 @@ def camera(size=8, target=0.0):
 
 
 encode = jax.jit(inference.encode, static_argnames="config")
-render = jax.jit(inference.render, static_argnames=("config", "options"))
+render = jax.jit(inference.render, static_argnames="config")
 
 
 @functools.cache
