@@ -38,7 +38,7 @@ READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # Phong parameters without a principled counterpart
 SHININESS = re.compile(r"\s*# Blender( MTL)?")  # Blender: Ns = 1000 (1 - roughness)^2, formerly 900
 OPTION = re.compile(
-    r"-(\w+)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))*)\s+"
+    r"(?<!\S)-([a-z]\w*)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))+)\s+"
 )
 
 
@@ -58,7 +58,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
     loading.say(*notes)
     library: dict[str, dict[str, str]] = {}
     for name in (name for names in text["mtllib"] for name in re.split(r"(?i)(?<=\.mtl)\s+(?!#)", names.strip())):
-        library |= parse_mtl(loading.read(name.partition(" #")[0]) or b"")
+        library |= parse_mtl(loading.read(name.partition(" #")[0].strip('" ')) or b"")
     looks: dict[str, Look] = {}
     for name in dict.fromkeys(text["usemtl"]):
         look, move = _look(name, library.get(name), loading) if name else (make_material(), UNMOVED)
@@ -223,11 +223,10 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
     move = UNMOVED
     wrap: assets.Wrap = "repeat"
     for key in MAPS:
-        statement, options, place = entry.get(key, ""), {}, 0
-        while option := OPTION.match(statement, place):
-            options[option[1]], place = option[2].split(), option.end()
+        statement = entry.get(key, "") + " "  # options stand before the file's name, in some files behind it
+        options = {option: words.split() for option, words in OPTION.findall(statement)}
         ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
-        file = statement[place:].strip("\"' \t").replace("\\", "/")
+        file = OPTION.sub("", statement).strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
             own = _pair(options.get("s", ()), 1.0), _pair(options.get("o", ()), 0.0)
             if maps and own != move:

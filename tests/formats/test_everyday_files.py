@@ -124,7 +124,7 @@ def test_colours_of_a_scene_are_told_whatever_numbers_hold_them(tmp_path, kind, 
     np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, BALL[~PART], atol=1e-6)
 
 
-PAINTED = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\n" + OBJ_FACE
+PAINTED = 'mtllib "a.mtl"\n' + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\n" + OBJ_FACE
 LIBRARIES = (
     "newmtl\ta\nKd\t0.25\t0.25\t0.25\n",
     "\ufeffnewmtl a\nKd 0.25 0.25 0.25\n",
