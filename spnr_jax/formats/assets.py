@@ -298,8 +298,9 @@ def decode_image(data: bytes) -> np.ndarray:
         raise ValueError("is not an image") from None
     if image.width * image.height > MOST_PIXELS:  # before allocating them
         raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-    if image.mode.startswith("I"):  # Pillow clips 16-bit grey to 255 instead of scaling it
-        image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+    if image.mode[0] in "IF":  # Pillow clips grey of 16 bits, or of floats 0 to 1, to 255 instead of scaling it
+        levels = np.asarray(image) * (255 if image.mode == "F" else 1 / 257)
+        image = Image.fromarray(np.round(np.clip(levels, 0, 255)).astype(np.uint8))
     return np.asarray(image.convert("RGBA"))
 
 

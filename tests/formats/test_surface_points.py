@@ -157,9 +157,10 @@ def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
     np.testing.assert_allclose(decode_texels(texels), expected, atol=1e-6)
 
 
-def test_sixteen_bit_grey_images_are_scaled_not_clipped():
+def test_grey_images_of_sixteen_bits_or_floats_are_scaled_not_clipped():
     stream = png(np.zeros((1, 1, 3)))
     assert decode_image(stream).tolist() == [[[0, 0, 0, 255]]]
-    stream = io.BytesIO()
-    Image.fromarray(np.array([[0, 32896, 65535]], np.uint16)).save(stream, "png")
-    assert decode_texels(decode_image(stream.getvalue())[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
+    for levels, kind in ((np.array([[0, 32896, 65535]], np.uint16), "png"), (np.float32([[-1, 128 / 255, 7]]), "tiff")):
+        stream = io.BytesIO()
+        Image.fromarray(levels).save(stream, kind)
+        assert decode_texels(decode_image(stream.getvalue())[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]
