@@ -88,9 +88,10 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
     columns: Columns = {}
     for name, values in fields.items():
         width = values.shape[1] if values.ndim == 2 else 1
+        own = name if name.lower() in columns else name.lower()  # of names that differ in letters the first is read
         if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
-            several = {f"{name.lower()}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
-            columns |= several or {name.lower(): values.reshape(-1)}
+            several = {f"{own}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
+            columns |= several or {own: values.reshape(-1)}
     return columns
 
 
