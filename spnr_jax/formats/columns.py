@@ -50,12 +50,12 @@ ALIASES = {  # our names -> groups of names in files, without separators; the fi
     for ours, stems, others in (
         (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
         (LINEAR, "basecolor albedo cd", "linearr linearg linearb|linearred lineargreen linearblue"),  # Houdini: Cd
-        (SRGB, "color colors rgb rgbs diffuse vertex", COLORS),
+        (SRGB, "color colors rgb rgbs rgba diffuse vertex", COLORS),
         (NORMAL, "n normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
         (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
-        (("alpha",), "", "a|diffusealpha|colora|rgb3|color3|colors3"),
+        (("alpha",), "", "a|diffusealpha|colora|rgb3|rgba3|color3|colors3"),
         (("opacity",), "", "opacities"),
         *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
@@ -257,9 +257,10 @@ def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
 
 
 def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
-    """Roughness or metallic in [0, 1] or of whole bytes, without rounding errors; ValueError if they lie outside."""
+    """Roughness or metallic in [0, 1], or of percent or whole bytes; ValueError if they lie outside."""
     highest = float(values.max(initial=0))
-    scale = full_scale(values.dtype, highest, linear=not 100 < highest <= 255 or bool((values % 1).any()))
+    percent, fractions = values.dtype != np.uint8 and 10 < highest <= 100, bool((values % 1).any())
+    scale = 100.0 if percent else full_scale(values.dtype, highest, fractions or not 100 < highest <= 255)
     if scale > 1:
         report(f"{name} taken to be in 0..{scale:g}")
     scaled = values / scale
@@ -287,7 +288,7 @@ def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
 def _unpack(packed: np.ndarray) -> np.ndarray:
     """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats with these bits (PCL)."""
     if packed.dtype == np.float64:  # holds all 32-bit integers, signed or not
-        packed = np.nan_to_num(packed)
+        packed = np.nan_to_num(packed, nan=0xFF << 24)  # black
     whole = bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())  # floats made of a colour's bits are tiny or NaN
     if packed.dtype.kind != "f" or whole:
         bits = packed.astype(np.int64).astype(np.uint32)
@@ -309,7 +310,8 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
         others = "; sRGB colours are named red green blue" if linear else " or 0 to 255"
         raise UserError(f"has {name} from {low:g} to {high:g}; expected 0 to 1{others}")
     values = channels / white
-    lines = [] if linear else [f"{name} taken as sRGB in 0..{white:g}"]
+    curve = "linear" if linear else "sRGB"
+    lines = [f"{name} taken as {curve} in 0..{white:g}"] if not linear or white > 1 else []
     if outside := int(np.count_nonzero((values > 1 + ROUNDING).any(axis=-1) | (values < -ROUNDING).any(axis=-1))):
         lines.append(f"{outside:,} of {len(values):,} colours lie outside of 0..{white:g} and are cut off there")
     values = np.clip(values, 0, 1)

@@ -44,7 +44,7 @@ THOUSANDS = (
     re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"),
 )
 PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
-PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})\s*", re.IGNORECASE)  # colour
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})((?<=#.{6})[0-9a-f]{2})?\s*", re.IGNORECASE)  # colour and alpha
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 DECIMAL = re.compile(r"(?<!\d)0,|,(?!\d{3}(?!\w))")  # a comma that separates no thousands
@@ -95,7 +95,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
                     raise broken
                 names = _name_words(names, table, words)
                 _report_cut_numbers(names, table, report)
-            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgb")
+            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgba")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         _report_counts(counted, report)
 
@@ -134,10 +134,10 @@ def _load_table(rows: list[Line], head: Head, words: Collection[int]) -> np.ndar
 
 
 def _name_words(names: tuple[str, ...], table: np.ndarray, words: Collection[int]) -> tuple[str, ...]:
-    """The names with those of columns of words marked; the first that holds colours is `rgb`."""
+    """The names with those of columns of words marked; the first that holds colours is `rgba`."""
     of_words = {i: f"{names[i]} (words)" for i in words}
     hexadecimal = [i for i in sorted(words) if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
-    of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
+    of_words |= dict.fromkeys(hexadecimal[:1], "rgba")
     return tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
 
 
@@ -231,8 +231,8 @@ def _are_cut(values: np.ndarray) -> bool:
 
 
 def _packed_color(word: str) -> float:
-    """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
-    return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
+    """The number 0xAARRGGBB of a word #rrggbb or #rrggbbaa, NaN for other words."""
+    return float(int((found[2] or "ff") + found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:

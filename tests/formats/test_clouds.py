@@ -102,11 +102,12 @@ def test_packed_colours_are_whole_numbers_of_any_type_or_have_their_bits(tmp_pat
     ("rough", "metal"),
     [("roughness", "scalar_metallic"), ("scalar_roughness", "metalness"), ("pbr_roughness", "metal")],
 )
-def test_roughness_and_metallic_have_many_names_and_whole_bytes(tmp_path, rough, metal):
-    _, roughness, metallic, lines = materials(tmp_path, **{rough: [0, 255, 0], metal: [0.25, 0.75, 0]})
-    np.testing.assert_array_equal(roughness, [0, 1, 0])
-    np.testing.assert_array_equal(metallic, [0.25, 0.75, 0])
-    assert lines == ["roughness taken to be in 0..255", "no base_color in the file: 0.5 taken for all points"]
+def test_roughness_and_metallic_have_many_names_and_percent_or_whole_bytes(tmp_path, rough, metal):
+    for white in (100, 255):
+        _, roughness, metallic, lines = materials(tmp_path, **{rough: [0, white, 0], metal: [0.25, 0.75, 0]})
+        np.testing.assert_array_equal(roughness, [0, 1, 0])
+        np.testing.assert_array_equal(metallic, [0.25, 0.75, 0])
+        assert lines == [f"roughness taken to be in 0..{white}", "no base_color in the file: 0.5 taken for all points"]
 
 
 def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is(tmp_path):

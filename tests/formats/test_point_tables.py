@@ -74,6 +74,7 @@ TEXTS = {
     "thousands, German": ("a.txt", table(";", columns=THOUSANDS).translate({44: ".", 46: ","})),
     "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
     "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
+    "packed colours and alpha": ("a.csv", "x,y,z,hex\n9,9,9,#28aa3c00\n" + table(",", ",#28AA3Cff", columns=POINTS)),
     "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
     "rows of dashes": (
         "a.txt",
@@ -175,8 +176,9 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
     turned = {"vertices": BALL.T, "vertex_colors": opaque[:, :3].T}
     maps = {"pts3d": BALL.reshape(20, 21, 3), "point_rgb": opaque.reshape(20, 21, 4)}
-    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque}
-    for arrays in ({"arr_0": ROWS}, tables, separate, {"pc": np.array(ROWS)}, turned, maps):
+    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque, "p": BALL[:, 0], "data": 3 * BALL}
+    igl = {"v": BALL, "f": np.zeros((9, 3)), "rgba": opaque}
+    for arrays in ({"arr_0": ROWS}, tables, separate, {"pc": np.array(ROWS)}, turned, maps, igl):
         np.savez(tmp_path / "c.npz", **arrays)
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
@@ -231,6 +233,11 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             "a.csv",
             "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF),
             "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
+        ),
+        (
+            "a.npz",
+            pack_arrays({"v": BALL, "cd": np.uint8([GREEN] * 420)}),
+            "base_color_r base_color_g base_color_b taken as",
         ),
         ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
         (
