@@ -57,6 +57,7 @@ FORTRAN = re.compile(r"(?<![#\w.])([+-]?(?:\d+(?:\.\d*)?|\.\d+))d(?=[+-]?\d)", r
 WHOLE = re.compile(r"(?<=\d)\.0+(?![\d.ed])", re.IGNORECASE)
 ONE_IN_BRACKETS = re.compile(r"[\[({][\d.,]+[])}]")  # accountants' negative numbers
 UNITS = re.compile(r"[(\[](?![\d.]+[)\]])[^()\[\]]*[)\]]")  # but not numbers: "Roughness (0.1)" of CloudCompare
+ONE_WORD = re.compile(r"(?=.*x)(?=.*y)(?=.*z)(n?[xyz]|[rgbai])+")  # all names, each of a letter
 AROUND_NAMES = re.compile(r"^[^:=]*[:=]|[][(){}'\"]")  # "columns: [x, y, z]"
 INDEX = "index"  # name of a column that is not used
 
@@ -334,6 +335,8 @@ def _split_names(text: str, filled: int, count: int) -> list[str]:
     names = [name.lower() for name in _words(text)]
     if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks
         names = text.lower().split()
+    if len(names) == 1 and ONE_WORD.fullmatch(names[0]):
+        names = [name.replace("i", "intensity") for name in re.findall("n?.", names[0])]
     while len(names) > filled and not names[-1]:
         names.pop()
     return names

@@ -93,6 +93,7 @@ TEXTS = {
         "x,y,z,r,g,b,name\n9,nan,9,1,2,3,A1\n" + table(",", ",12"),
     ),
     "names behind a word": ("a.txt", "# columns: b g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "names in one word": ("a.txt", "# bgrzyx\n" + table(" ", columns=BACKWARDS)),
     "names in brackets": ("a.txt", "# ['b', 'g', 'r', 'z', 'y', 'x']\n" + table(" ", columns=BACKWARDS)),
     "names behind a semicolon": ("a.txt", "; b g r z y x\n" + table(" ", columns=BACKWARDS)),
     "words first, decimal commas": ("a.csv", WORDY.replace(",", ";").replace(".", ",")),
