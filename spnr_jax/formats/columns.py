@@ -213,7 +213,7 @@ def materials(columns: Columns, report: Report) -> dict[str, np.ndarray]:
 
     If the file has neither roughness nor metallic, also `materials_known` (points,), all 0.
     """
-    count, found = len(columns["x"]), {"base_color": _base_color(columns, report)}
+    count, found = len(columns["x"]), {"base_color": base_color(columns, report)}
     found |= {name: _unit_interval(columns[name], name, report) for name in [*DEFAULTS][1:] if name in columns}
     complete = {} if len(found) > 1 else {"materials_known": np.zeros(count)}
     for name, default in DEFAULTS.items():
@@ -234,7 +234,7 @@ def normals(columns: Columns) -> np.ndarray | None:
     return np.where(usable, vectors / np.where(usable, length, 1), 0) if usable.any() else None
 
 
-def _base_color(columns: Columns, report: Report) -> np.ndarray | None:
+def base_color(columns: Columns, report: Report) -> np.ndarray | None:
     """Linear base colours (points, 3), from colours or intensities; None if there are none."""
     intensity = np.asarray(columns.get("intensity", [np.nan]), np.float64)
     colors, lines = colors_of(columns) or (None, [])

@@ -17,7 +17,7 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import RGB, Loading, Part, Texels, make_material
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, colors_of, rename, useful
+from spnr_jax.formats.columns import NORMAL, SRGB, Columns, base_color, colors_of, describe_use, rename, useful
 from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.row_files import USED, Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
@@ -159,6 +159,7 @@ def colored_part(
     Vertices of one colour beside polygons of several do not count.
     """
     columns = useful(vertices)
+    loading.say(*describe_use(vertices))
     positions = stack_columns(columns)
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
@@ -171,6 +172,8 @@ def colored_part(
         positions = positions[faces.ravel()]
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
+    elif colors is None:
+        colors = base_color(columns, loading.say)  # of intensities
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]

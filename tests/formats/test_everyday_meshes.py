@@ -249,3 +249,12 @@ def test_lines_and_other_elements_that_are_not_read_are_said(tmp_path):
     more = "element material 1\nproperty uchar red\n"
     content = two_squares_ply(more, "", "", "", ["", ""]).replace("end_header\n", "end_header\n7\n")
     assert "ignored: PLY element material" in read(write(tmp_path, "a.ply", content), num_points=9)[1]
+
+
+def test_intensities_of_vertices_are_grey_and_their_other_columns_are_said(tmp_path):
+    rows = two_squares_ply("", "property float intensity\nproperty int flags\n", "", "7 0", ["", ""])
+    content = rows.replace("5 7 0", "5 90 0")
+    cloud, lines = read(write(tmp_path, "a.ply", content), num_points=50)
+    assert (np.ptp(cloud.base_color, axis=1) == 0).all()
+    np.testing.assert_array_equal(cloud.base_color[:, 0] > 0.9, cloud.positions[:, 2] > 1)
+    assert {"no colour in the file: intensity 7..90 shown as grey", "columns that are not used: flags"} <= {*lines}
