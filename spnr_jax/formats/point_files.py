@@ -48,7 +48,7 @@ TEXTS = (
     (BLANK + rb"(ST|C|N)*4?n?OFF(?=\d|\b)", (".off",)),
     (BLANK + rb"(mtllib\s|[og]\s[^\n\r]*[\n\r]\s*v\s|v\s+" + NUMBER + rb"\s)", (".obj",)),
     (BLANK + rb"[\s,;]+".join(3 * [NUMBER]) + rb"[\s,;]", (*TEXT, ".off")),
-    (BLANK + rb"x[\s,;]+y[\s,;]+z\b", TEXT),
+    (BLANK + rb"[\"/%]*x[\s,;\"]+y[\s,;\"]+z\b", TEXT),
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"

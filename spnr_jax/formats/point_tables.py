@@ -202,6 +202,7 @@ def _plain(line: str) -> str:
     if PLAIN.fullmatch(text := line.strip()):
         return text
     text = text.strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
+    text = re.sub(r"^[\w.= ]+\(?(?=\[\[)", "", text)  # array([[ of NumPy
     if text[:1] in ("[", "(", "{") and not ONE_IN_BRACKETS.match(text):
         text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
     if '"' in text:
