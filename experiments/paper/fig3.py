@@ -105,7 +105,7 @@ def all_methods(runs: tuple[str, ...]) -> dict[str, Method]:
 
 def measure(points: int, method: Method, item: ObjectData) -> Measured:
     """Mean metrics of an object's views, and the depth map of the first."""
-    pictures = method.show(cut(item, points, normals=True))
+    pictures = method.show(cut(item, points))
     each = score(item, pictures)
     found = scores.mean_scores({name: [of[name] for of in each] for name in COLUMNS})
     assert pictures.depth is not None

@@ -83,7 +83,8 @@ def data(tmp_path_factory):
 
 
 def draw_grey(_, item):
-    """Every pixel of the object, grey and at one depth."""
+    """Every pixel of the object, grey and at one depth, of points without normals, as in all comparisons."""
+    assert item.cloud.normals is None
     acc = item.images[..., 3] / np.float32(255)
     image = np.repeat(np.where(acc > 0, 0.5, 1)[..., None], 3, axis=-1)
     return evaluation.Pictures(image=image, acc=acc, depth=np.full(acc.shape, 2.5, np.float32))
