@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int
 import spnr_jax
 from experiments import entry_point
 from experiments.comparison import figures, results_folder
-from experiments.comparison.study_objects import cut
+from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
 from spnr_jax.formats import data_sets, images
@@ -135,8 +135,8 @@ def main(options: InverseStudy) -> None:
 def read(folder: Path, count: int) -> dict[str, PointCloud]:
     """The first four test objects of a data set, without normals."""
     dataset = data_sets.open_dataset(folder)
-    items = {name: data_sets.read_object(dataset, name) for name in dataset.splits["test"][:4]}
-    return {name: cut(item, count).cloud for name, item in items.items()}
+    names = test_objects(dataset, None, count)[:4]
+    return {name: cut(data_sets.read_object(dataset, name), count).cloud for name in names}
 
 
 def shapes(count: int) -> dict[str, PointCloud]:

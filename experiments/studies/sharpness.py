@@ -85,12 +85,12 @@ def main(options: SharpnessStudy) -> None:
     """Draws, scores and writes."""
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects, max(options.counts))
-    asked = {name: getattr(options, name) for name in ("counts", "views", "resolution", "normals")}
-    asked |= {"runs": contenders.checksums(options.runs)}
-    results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
     models = contenders.of_runs(options.runs)
     for model, _ in models.values():
         check_known_light(model.config, dataset)
+    asked = {name: getattr(options, name) for name in ("counts", "views", "resolution", "normals")}
+    asked |= {"runs": contenders.checksums(options.runs)}
+    results_folder.claim(options.out, "sharpness", asked | {"objects": names}, dataset)
     compared = {label: contenders.of_model(*model) for label, model in models.items()}
     if options.poisson:
         compared["Poisson, trimmed"] = Renderer(dataset.settings, options.envmap).method("poisson_trimmed")

@@ -41,6 +41,7 @@ from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.records import Encoded
 from spnr_jax.method.model import Model
+from spnr_jax.scoring.evaluation import check_known_light
 from spnr_jax.scoring.report import Table, number, text
 from spnr_jax.training.weights import load
 
@@ -196,6 +197,8 @@ def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the tables and the plot."""
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, options.objects, max(options.counts))
+    for run in options.runs:
+        check_known_light(load(run).config, dataset)
     asked = {"objects": names, "views": options.views, "runs": list(checksums(options.runs).items())}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
     rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]

@@ -26,7 +26,7 @@ from experiments.comparison.variants import Budget
 from experiments.packaged import demo
 from experiments.paper import fig2, fig3, table1
 from experiments.speed import bench
-from experiments.studies import inverse, relighting, sharpness
+from experiments.studies import inverse, relighting, sharpness, speed_accuracy
 from spnr_jax import presets
 from spnr_jax.config import SurfelConfig
 from spnr_jax.formats import data_sets
@@ -266,6 +266,16 @@ def test_what_a_command_cannot_do_is_refused_by_name(data, tmp_path, monkeypatch
     given = {"data": data.painted, "out": tmp_path / "new", "budget": Budget(quick=True)}
     with pytest.raises(ValueError, match="spnr-data generate DIR --colour-variants 5"):
         fig2.main(fig2.Fig2(**given))
+    sky = shutil.copytree(data.painted, tmp_path / "sky")
+    described = json.loads((sky / "dataset.json").read_text()) | {"environment_map": {"name": "sky.hdr"}}
+    (sky / "dataset.json").write_text(json.dumps(described))
+    drawn = {"data": sky, "out": tmp_path / "new", "runs": (data.run(),), "counts": (32,)}
+    for study in (sharpness.SharpnessStudy, speed_accuracy.SpeedAccuracy):
+        with pytest.raises(ValueError, match=r"lit by sky\.hdr"):
+            sys.modules[study.__module__].main(study(**drawn))
+    (sky / "splits" / "test.txt").write_text("")
+    with pytest.raises(ValueError, match="the test split is empty"):
+        inverse.main(inverse.InverseStudy(data=sky, out=tmp_path / "new", quick=True))
     assert not (tmp_path / "new").exists()
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     asked = {"data": data.painted, "budget": "quick", "variant": "scalar_rgb"}
