@@ -168,6 +168,7 @@ class Browser:
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
         self._light: dict[str, Any] = {}
+        self._opening = threading.Lock()  # one file after the other: the last stays
         self.loop = Loop(first, lambda state, moving: self._try(lambda: self._draw(state, moving)))
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
@@ -295,9 +296,10 @@ class Browser:
             self.loop.submit(lambda state: self._show_choice(frame.add_map(state, name, light)))
             return
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)
-        cloud = frame.read_upload(file.name, file.content, read)
-        self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
-        self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
+        with self._opening:
+            cloud = frame.read_upload(file.name, file.content, read)
+            self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
+            self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 
     def _show_choice(self, state: State) -> State:
         self._light["choice"].options, self._light["choice"].value = state.lights, state.light_name

@@ -69,3 +69,25 @@ def test_the_page_says_why_a_picture_takes_long_until_it_is_drawn_or_fails(monke
         if error:
             raise error
     assert page._status.content == ""
+
+
+def test_of_two_files_the_one_that_was_opened_last_stays_though_the_first_takes_longer(monkeypatch):
+    begun, shown = threading.Event(), []
+
+    def read(name, *_):
+        if name == "large.ply":
+            begun.set()
+            time.sleep(0.3)
+        return SimpleNamespace(positions=[])
+
+    monkeypatch.setattr(server.frame, "read_upload", read)
+    page = SimpleNamespace(_opening=threading.Lock(), _model=SimpleNamespace(encode=id), _reading={})
+    page._replace, page._title = lambda name, **_: shown.append(name), SimpleNamespace()
+    files = [server.viser.UploadedFile(name, b"") for name in ("large.ply", "small.ply")]
+    first = threading.Thread(target=server.Browser._open, args=(page, files[0]))
+    first.start()
+    assert begun.wait(10)
+    server.Browser._open(page, files[1])
+    first.join(10)
+    assert shown == ["large.ply", "small.ply"]
+    assert page._title.content.startswith("small.ply")
