@@ -100,6 +100,16 @@ def test_the_page_of_a_cloud_shows_what_the_network_draws(chromium, tmp_path, mo
         assert decibels(np.ones_like(network), network) < 15
 
 
+def test_the_page_draws_again_once_the_browser_took_the_graphics_away_and_gave_them_back(chromium, tmp_path):
+    path, poster = page(tmp_path, 0)
+    with opened(chromium, path) as tab:
+        tab.evaluate("lender = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); lender.loseContext()")
+        tab.wait_for_timeout(300)
+        tab.evaluate("lender.restoreContext()")
+        until(tab, "!canvas.getContext('webgl2').isContextLost()")
+        assert decibels(shown(tab), poster) > 32
+
+
 def test_dragging_turns_the_object_as_a_camera_would_go_around_it(chromium, tmp_path):
     path, poster = page(tmp_path, 1)
     with opened(chromium, path) as tab:
