@@ -93,7 +93,8 @@ def make_render_options(options: Export | Share, cloud: Path, run: Path | None) 
 
 def describe_source(options: Render) -> str:
     """The line that names cloud, network and light, without folders."""
-    light = Path(options.lighting.light or ("sun" if options.lighting.sun else "room")).name
+    lights = (options.lighting.light, "sun" if options.lighting.sun else None)
+    light = " + ".join(Path(name).name for name in lights if name) or "room"
     return f"{options.cloud.name}, drawn by spnr_jax ({Path(options.run or weights.PACKAGED).name}), light: {light}"
 
 

@@ -111,5 +111,6 @@ def test_a_page_that_is_too_large_is_refused(monkeypatch):
     poster = np.ones((8, 8, 3), np.float32)
     with pytest.raises(ValueError, match="--most-splats"):
         export.page(splat_balls.ball(50), poster, splat_balls.camera(size=8), (30.0, 20.0), "t", "n")
-    asked = Render(cloud=Path("a/b.ply"), lighting=Lighting(light="/home/me/sky.hdr"))
-    assert export.describe_source(asked) == "b.ply, drawn by spnr_jax (surfels), light: sky.hdr", "without folders"
+    asked = Render(cloud=Path("a/b.ply"), lighting=Lighting(light="/home/me/sky.hdr", sun=(40, 30)))
+    named = export.describe_source(asked)
+    assert named == "b.ply, drawn by spnr_jax (surfels), light: sky.hdr + sun", "without folders"
