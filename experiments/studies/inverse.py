@@ -38,6 +38,7 @@ from experiments.comparison import figures, results_folder
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax.devices import runtime
 from spnr_jax.devices.runtime import QUICKEST
+from spnr_jax.errors import require_at_least
 from spnr_jax.formats import data_sets, images
 from spnr_jax.kernels import cameras
 from spnr_jax.kernels.cloud_arrays import make_cloud
@@ -81,6 +82,9 @@ class InverseStudy:
     """Steps of Adam."""
     quick: bool = False
     """Two objects, 128 points, 32 pixels and 3 steps: whether it works."""
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "points", "size", "steps")
 
 
 class Unknowns(NamedTuple):

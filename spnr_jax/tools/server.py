@@ -296,10 +296,14 @@ class Browser:
             self.loop.submit(lambda state: self._show_choice(frame.add_map(state, name, light)))
             return
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)
-        with self._opening:
-            cloud = frame.read_upload(file.name, file.content, read)
-            self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
-            self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
+        opening = self._client.add_notification("Opening", name, loading=True, with_close_button=False)
+        try:
+            with self._opening:
+                cloud = frame.read_upload(file.name, file.content, read)
+                self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
+                self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
+        finally:
+            opening.remove()
 
     def _show_choice(self, state: State) -> State:
         self._light["choice"].options, self._light["choice"].value = state.lights, state.light_name

@@ -276,6 +276,8 @@ def test_what_a_command_cannot_do_is_refused_by_name(data, tmp_path, monkeypatch
     (sky / "splits" / "test.txt").write_text("")
     with pytest.raises(ValueError, match="the test split is empty"):
         inverse.main(inverse.InverseStudy(data=sky, out=tmp_path / "new", quick=True))
+    with pytest.raises(ValueError, match="--steps"):
+        inverse.InverseStudy(out=tmp_path / "new", steps=0)
     assert not (tmp_path / "new").exists()
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
     asked = {"data": data.painted, "budget": "quick", "variant": "scalar_rgb"}

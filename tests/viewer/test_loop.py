@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -81,7 +82,8 @@ def test_of_two_files_the_one_that_was_opened_last_stays_though_the_first_takes_
         return SimpleNamespace(positions=[])
 
     monkeypatch.setattr(server.frame, "read_upload", read)
-    page = SimpleNamespace(_opening=threading.Lock(), _model=SimpleNamespace(encode=id), _reading={})
+    client = MagicMock()
+    page = SimpleNamespace(_opening=threading.Lock(), _model=SimpleNamespace(encode=id), _reading={}, _client=client)
     page._replace, page._title = lambda name, **_: shown.append(name), SimpleNamespace()
     files = [server.viser.UploadedFile(name, b"") for name in ("large.ply", "small.ply")]
     first = threading.Thread(target=server.Browser._open, args=(page, files[0]))
@@ -91,3 +93,5 @@ def test_of_two_files_the_one_that_was_opened_last_stays_though_the_first_takes_
     first.join(10)
     assert shown == ["large.ply", "small.ply"]
     assert page._title.content.startswith("small.ply")
+    assert [call.args for call in client.add_notification.call_args_list] == [("Opening", x.name) for x in files]
+    assert client.add_notification.return_value.remove.call_count == 2
