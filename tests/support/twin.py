@@ -1,4 +1,4 @@
-"""The parity fixture: weights, inputs and every stage's output of a PyTorch twin in float64, under the twin's names.
+"""The parity fixture: weights, inputs and what is compared of a PyTorch twin in float64, under the twin's names.
 
 "meta" is JSON with its config, "param/gen.*" and "param/disc.*" are its state_dicts, "in/*" is its batch.
 """
