@@ -124,26 +124,6 @@ def test_colours_of_a_scene_are_told_whatever_numbers_hold_them(tmp_path, kind, 
     np.testing.assert_allclose(read_cloud(builder.write(tmp_path / "a.glb")).positions, BALL[~PART], atol=1e-6)
 
 
-PAINTED = 'mtllib "a.mtl"\n' + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl a\n" + OBJ_FACE
-LIBRARIES = (
-    "newmtl\ta\nKd\t0.25\t0.25\t0.25\n",
-    "\ufeffnewmtl a\nKd 0.25 0.25 0.25\n",
-    "newmtl a\nKd 0.25 0.25 0.25 # grey\nNs 10 # dull\n",
-    "newmtl a\nKd 0.25\n",
-    'newmtl a\nmap_Kd -type sphere -imfchan r "gone.png"\nKd 0.25\n',
-    "newmtl a\nKd 63.75 63.75 63.75\n",
-)
-
-
-def test_libraries_of_materials_are_read_however_they_are_written(tmp_path):
-    for library in LIBRARIES:
-        write(tmp_path, "a.mtl", library)
-        cloud, lines = read(write(tmp_path, "a.obj", PAINTED), num_points=9)
-        np.testing.assert_allclose(cloud.base_color, np.full((9, 3), 0.25), atol=1e-6)
-        assert any("Kd beyond 1" in line for line in lines) == ("63" in library)
-        assert "9 points alone tell next to no surface: the picture is a guess" in lines
-
-
 def colored_ball(folder, colors=GREEN, kind: str = "<u2", **more: np.ndarray):
     """A file of the ball with colours, one or (420, 3), and other columns."""
     colors = np.broadcast_to(colors, (420, 3)).astype(kind)

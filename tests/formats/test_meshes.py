@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, png
+from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder
 from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent, obj_leaf, refusal, write_obj
 
 from data_gen.plan.sources import find_meshes
@@ -180,29 +180,16 @@ def test_the_roughness_of_blenders_files_is_the_one_that_it_wrote_them_from(tmp_
         assert look.roughness == pytest.approx(roughness, abs=1e-6)
 
 
-MASKS = {  # a picture of map_d; whether the half of it that is dark is cut out
-    "opaque colours": (CHECKER, False),
-    "grey": (np.repeat(np.where(np.arange(6) < 3, 0, 255)[None, :, None], 3, axis=2).repeat(4, axis=0), True),
-    "alpha": (np.dstack([CHECKER, np.where(np.arange(6) < 3, 0, 255) * np.ones((4, 1))]), True),
-}
-
-
-@pytest.mark.parametrize("mask", MASKS)
-def test_a_mask_is_the_alpha_of_a_picture_or_a_grey_one(tmp_path, mask):
-    texels, cuts = MASKS[mask]
-    path = write_obj(tmp_path, TEXTURED, "newmtl paint\nmap_Kd pine.png\nmap_d mask.png\n")
-    (tmp_path / "mask.png").write_bytes(png(texels))
-    opacity = load_mesh(path, transparent_parts="opaque").parts[0].material.opacity
-    assert (opacity is not None) == cuts
-    assert not cuts or ((opacity[:, :3] < 0.5).all() and (opacity[:, 3:] > 0.5).all())
-
-
-def test_two_libraries_in_one_line_and_vertices_of_which_some_have_a_colour_are_read(tmp_path):
-    for name, color in (("one", "1 0 0"), ("two", "0 0 1")):
-        (tmp_path / f"{name} 1.mtl").write_text(f"newmtl {name}\nKd {color}\n")
-    text = "mtllib one 1.mtl two 1.mtl\n" + VERTICES + "usemtl one\nf 1 2 3\nusemtl two\nf 1 3 4\n"
+def test_materials_with_odd_names_of_two_libraries_in_one_line_make_two_parts(tmp_path):
+    for library, name, color in (("one 1", "dark wood #2", "0.25 0 0"), ("two 1", "usemtl", "0 0 0.5")):
+        (tmp_path / f"{library}.mtl").write_text(f"newmtl {name}\nKd {color}\n")
+    text = f"mtllib one 1.mtl two 1.mtl\n{VERTICES}usemtl dark wood #2\nf 1 2 3\nusemtl usemtl \nf 1 3 4\n"
     parts = load_mesh(write_obj(tmp_path, text)).parts
-    assert {tuple(part.material.base_color) for part in parts} == {(1, 0, 0), (0, 0, 1)}
+    look = {tuple(part.material.base_color): part.positions.tolist() for part in parts}
+    assert look == {(0.25, 0, 0): [[0, 0, 0], [1, 0, 0], [1, 1, 0]], (0, 0, 0.5): [[0, 0, 0], [1, 1, 0], [0, 1, 0]]}
+
+
+def test_vertices_without_a_colour_among_others_are_white_and_counted(tmp_path):
     mixed = VERTICES.replace("0 0 0", "0 0 0 1 0 0 # red") + "v -nan(ind) 0 0\nf 1 2 3\nf 1 3 4\nf 1 2 5\n"
     asset = load_mesh(write_obj(tmp_path, mixed), transparent_parts="opaque")
     np.testing.assert_array_equal(asset.parts[0].colors, [[1, 0, 0], *3 * [[1, 1, 1]]])
@@ -220,13 +207,6 @@ def test_an_image_that_cannot_be_read_leaves_plain_values_for_pictures(tmp_path)
     np.testing.assert_array_equal(asset.parts[0].material.base_color, [0, 0.5, 0])
     assert any("cannot be read: light.exr (is not an image)" in note for note in asset.notes)
     assert "light.exr" in refusal(path)
-
-
-def test_two_materials_with_odd_names_make_two_parts(tmp_path):
-    text = VERTICES + "usemtl dark wood #2\nf 1 2 3\nusemtl usemtl \nf 1 3 4\n"
-    parts = load_mesh(write_obj(tmp_path, text, "newmtl dark wood #2\nKd 0.25 0 0\nnewmtl usemtl\nKd 0 0 0.5\n")).parts
-    look = {tuple(part.material.base_color): part.positions.tolist() for part in parts}
-    assert look == {(0.25, 0, 0): [[0, 0, 0], [1, 0, 0], [1, 1, 0]], (0, 0, 0.5): [[0, 0, 0], [1, 1, 0], [0, 1, 0]]}
 
 
 def test_of_faces_on_the_same_corners_that_of_the_first_material_is_kept_whatever_their_order(tmp_path):
@@ -292,6 +272,7 @@ CASES = {  # writer, its arguments; share and note for `opaque` and for `skip`
     "OBJ's Tr": (obj_leaf, ("Kd 1 0 0\nTr 0.8",), (ALL, DRAWN), (NONE, LEFT_OUT)),
     "grey map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()[..., 3]), (HALF, CUT), (HALF, CUT)),
     "alpha of map_d": (obj_leaf, ("map_d -clamp on mask.png", half_transparent()), (HALF, CUT), (HALF, CUT)),
+    "map_d of opaque colours": (obj_leaf, ("map_d mask.png", np.uint8(CHECKER)), (ALL, None), (ALL, None)),
 }
 
 
@@ -339,6 +320,3 @@ def test_missing_images_and_libraries_leave_plain_values_and_are_named(tmp_path)
     asset = load_mesh(wood, transparent_parts="opaque")
     assert "names a file that is missing: 'look.mtl'" in asset.notes[0]
     assert "uses a material that no library defines: 'leaf', 'plain'" in asset.notes[1]
-    for path, name in ((bare, "maps/color.png"), (wood, "look.mtl")):
-        with pytest.raises(UserError, match=f"missing: '{name}'"):
-            load_mesh(path)
