@@ -9,9 +9,7 @@ from PIL import Image
 from support.gltf_files import CORNERS, SQUARE, UV, GltfBuilder, png
 from support.handmade import plain
 
-from data_gen.render.variant import mitsuba_module
-from data_gen.render.views import bitmap_texture
-from spnr_jax.formats.assets import Asset, Part, decode_image, decode_texels, lookup
+from spnr_jax.formats.assets import Asset, Part, decode_image, decode_texels
 from spnr_jax.formats.meshes import load_mesh
 from spnr_jax.formats.surface_points import normalise, sample_surface
 
@@ -122,33 +120,6 @@ def test_vertex_normals_are_what_is_tilted(tmp_path):
 
 
 # Texels
-
-MODES = ("repeat", "mirror", "clamp")
-
-
-@pytest.fixture
-def mi():
-    """Mitsuba in its scalar variant, which other tests do not depend on."""
-    mitsuba = pytest.importorskip("mitsuba")
-    before = mitsuba.variant()
-    yield mitsuba_module("scalar_rgb")  # on one thread, which whoever renders next relies on
-    if before:
-        mitsuba_module(before)
-
-
-@pytest.mark.parametrize("wrap", MODES)
-@pytest.mark.parametrize("shape", [(5, 3, 3), (4, 7), (1, 1, 3), (1, 6)])
-def test_lookup_is_what_mitsuba_evaluates(mi, wrap, shape):
-    rng = np.random.default_rng(3)
-    texels = rng.random(shape, dtype=np.float32)
-    texcoords = rng.uniform(-2.5, 3.5, (200, 2)).astype(np.float32)
-    texture = mi.load_dict(bitmap_texture(texels if len(shape) == 3 else texels[..., None], wrap))
-    hit = mi.SurfaceInteraction3f()
-    expected = []
-    for u, v in texcoords.tolist():
-        hit.uv = mi.Point2f(u, v)
-        expected.append(np.array(texture.eval(hit)) if len(shape) == 3 else texture.eval_1(hit))
-    np.testing.assert_allclose(lookup(texels, texcoords, wrap), expected, atol=2e-5)
 
 
 def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.gltf_files import CORNERS, UV, GltfBuilder
+from support.gltf_files import CORNERS, UV, GltfBuilder, one_square
 from support.handmade import WHITE_LIGHT, box, plain
 
 from data_gen.render import views
@@ -64,17 +64,9 @@ def assert_agreement(asset, varying=(), **options):
     return told
 
 
-def square(tmp_path, material=None, node=None, builder=None, positions=CORNERS, **attributes):
-    """The asset of a glTF file with one square of a material."""
-    builder = builder or GltfBuilder()
-    index = None if material is None else builder.material(**material)
-    builder.mesh(builder.primitive(positions, material=index, **attributes), **(node or {}))
-    return meshes.load_mesh(builder.write(tmp_path / "square.glb"))
-
-
-def textured(builder, texels=NOISE, info=None, sampler=None, **factors):
+def textured(builder, texels=NOISE, sampler=None, **factors):
     """A glTF material with a base-colour texture."""
-    texture = {"index": builder.texture(texels, **(sampler or {})), **(info or {})}
+    texture = {"index": builder.texture(texels, **(sampler or {}))}
     return {"pbrMetallicRoughness": {"baseColorTexture": texture, **factors}}
 
 
@@ -104,17 +96,15 @@ def wrapped(code):
     return lambda builder: textured(builder, sampler={"wrapS": code, "wrapT": code})
 
 
-MOVED = {"extensions": {"KHR_texture_transform": {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5]}}}
 TEXTURE, FAR = {"TEXCOORD_0": UV}, {"TEXCOORD_0": UV * np.float32(4.3) - np.float32(1.7)}
 TINTS = {"COLOR_0": np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])}
 ONE_TINT = "vertex colours that vary over a texture (their mean is used)"
 BASE = ("base_color",)
 SQUARES = {  # case: material, attributes of vertices, the channels that vary, what is said to be ignored
-    "a texture that is moved": (lambda builder: textured(builder, info=MOVED), TEXTURE, BASE),
     **{f"a texture that wraps by {code}": (wrapped(code), FAR, BASE) for code in (10497, 33648, 33071)},
     **{f"a texture of {size}": (sized(*size), TEXTURE, BASE) for size in ((1, 6), (6, 1), (2, 2), (33, 17))},
     "a texture of one texel": (sized(1, 1), TEXTURE, ()),
-    "channels with textures of their own size": (own_sizes, TEXTURE, CHANNELS),
+    "channels with textures of their own size": (own_sizes, FAR, CHANNELS),
     "vertex colours times a factor": (lambda builder: factors((0.5, 1, 0.8), 0.4, 0.2), TINTS, BASE),
     "vertex colours over a surface texture": (
         lambda builder: {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": builder.texture(NOISE)}}},
@@ -144,31 +134,30 @@ class TestGltf:
             np.testing.assert_allclose(told["roughness"][near], roughness, atol=1e-6)
             np.testing.assert_allclose(told["metallic"][near], metallic, atol=1e-6)
 
-    @pytest.mark.parametrize("mirrored", [False, True])
     @pytest.mark.parametrize("smooth", [False, True])
-    def test_flat_smooth_and_mirrored_faces_show_their_texture_and_normals(self, tmp_path, smooth, mirrored):
+    def test_flat_and_smooth_faces_show_their_texture_and_normals(self, tmp_path, smooth):
         builder = GltfBuilder()
         tilted = np.float32([[-1, 0, 2], [1, 0, 2], [1, 1, 2], [-1, 1, 2]])
         tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
         attributes = {"TEXCOORD_0": UV} | ({"NORMAL": tilted} if smooth else {})
-        node = {"scale": [-1, 2, 1]} if mirrored else {"rotation": [0, 0.2, 0, 0.96**0.5]}
-        asset = square(tmp_path, textured(builder), node, builder, **attributes)
+        node = {"rotation": [0, 0.2, 0, 0.96**0.5]}
+        asset = one_square(tmp_path, builder, node, material=builder.material(**textured(builder)), **attributes)
         told = assert_agreement(asset, varying=["base_color"])
-        assert told["normals"][:, 2].min() > 0.5  # towards the camera, mirrored or not
+        assert told["normals"][:, 2].min() > 0.5  # towards the camera
         assert (np.ptp(told["normals"], axis=0).max() > 0.2) == smooth
 
     @pytest.mark.parametrize("double_sided", [False, True])
     def test_faces_seen_from_behind_show_the_same_material(self, tmp_path, double_sided):
         builder = GltfBuilder()
-        material = textured(builder) | {"doubleSided": double_sided}
-        asset = square(tmp_path, material, builder=builder, TEXCOORD_0=UV)
+        material = builder.material(**textured(builder), doubleSided=double_sided)
+        asset = one_square(tmp_path, builder, material=material, TEXCOORD_0=UV)
         assert assert_agreement(asset, varying=["base_color"], eye=EYE * [1, 1, -1])["normals"][:, 2].min() > 0.99
 
     @pytest.mark.parametrize("case", SQUARES)
     def test_what_a_square_of_a_material_is_told_to_be_it_shows(self, tmp_path, case):
         material, attributes, varying, *ignored = SQUARES[case]
         builder = GltfBuilder()
-        asset = square(tmp_path, material(builder), builder=builder, **attributes)
+        asset = one_square(tmp_path, builder, material=builder.material(**material(builder)), **attributes)
         assert asset.ignored == tuple(ignored)
         assert_agreement(asset, varying=varying, count=1500 if "wraps" in case else 400)
 
