@@ -17,7 +17,6 @@ from support.gltf_files import (
     one_square,
     png,
     skinned,
-    textured_square,
 )
 from support.mesh_files import glass, painted, refusal, square
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
@@ -275,7 +274,8 @@ def test_colours_on_a_texture_multiply_it_and_for_references_their_mean_does(tmp
         "TEXCOORD_0": np.tile(UV * 0 + 0.5, (2, 1)),
         "COLOR_0": np.repeat(np.float32([[1, 1, 1], [0.25, 0.5, 0.75]]), 4, axis=0),
     }
-    asset = textured_square(tmp_path, **two)
+    builder = GltfBuilder()
+    asset = one_square(tmp_path, builder, material=builder.material(**painted()(builder)), **two)
     if not strict:
         asset = load_mesh(tmp_path / "square.glb", transparent_parts="opaque")
     points = sample_surface(asset, 50, 0)

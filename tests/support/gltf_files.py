@@ -108,18 +108,6 @@ def one_square(tmp_path, builder=None, node=None, **primitive):
     return load_mesh(builder.write(tmp_path / "square.glb"))
 
 
-def textured_square(tmp_path, info=None, factors=None, sampler=None, **attributes):
-    builder = GltfBuilder()
-    texture = builder.texture(CHECKER, **(sampler or {}))
-    pbr = {"baseColorTexture": {"index": texture, **(info or {})}, **(factors or {})}
-    return one_square(
-        tmp_path,
-        builder,
-        material=builder.material(pbrMetallicRoughness=pbr),
-        **({"TEXCOORD_0": UV} | attributes),
-    )
-
-
 def skinned(joints=((0, 0, 0, 0),) * 4, armature=None, inverse=None, **node) -> GltfBuilder:
     """A scene of a square that hangs on one joint of a moved armature, half of its weights written."""
     builder = GltfBuilder()

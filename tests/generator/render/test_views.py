@@ -17,10 +17,6 @@ def picture(asset, eye, config=CONFIG):
     return views.straight_srgb(views.render_view(scene, views.look_at(np.asarray(eye, float)), config, 0))
 
 
-def strongest_channel(image, rows, columns):
-    return int(image[rows, columns, :3].reshape(-1, 3).astype(float).mean(0).argmax())
-
-
 def test_cameras_are_orthonormal_right_handed_look_at_the_origin_and_stand_at_the_distance():
     poles = np.stack([views.look_at(3 * np.array([0.0, sign, 1e-9])) for sign in (-1, 1)])
     for pose in [*poles, *views.random_viewpoints(50, 3.0, np.random.default_rng(0))]:
@@ -28,23 +24,13 @@ def test_cameras_are_orthonormal_right_handed_look_at_the_origin_and_stand_at_th
         np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
         np.testing.assert_allclose(eye, 3 * rotation[:, 2], atol=1e-8)
+        assert rotation[1, 1] > -1e-6, "up is up in the picture"
 
 
 def test_random_viewpoints_cover_the_sphere_uniformly():
     heights = views.random_viewpoints(4000, 2.0, np.random.default_rng(1))[:, 1, 3] / 2
     shares = np.histogram(heights, bins=4, range=(-1, 1))[0] / 4000
     np.testing.assert_allclose(shares, 0.25, atol=0.03)  # equal areas between equal steps of height (Archimedes)
-
-
-def test_right_is_right_and_up_is_up_in_the_picture():
-    # seen from +z: the red box at +x is on the right, the green one at +y on top, the blue one at the lower left
-    boxes = ((0.5, 0, 0), RED), ((0, 0.5, 0), GREEN), ((-0.4, -0.4, 0), BLUE)
-    parts = tuple(box(centre, (0.15, 0.15, 0.15), plain(color)) for centre, color in boxes)
-    image = picture(Asset(parts=parts), (0, 0, 3))
-    assert strongest_channel(image, slice(12, 20), slice(20, 28)) == 0
-    assert strongest_channel(image, slice(4, 12), slice(12, 20)) == 1
-    assert strongest_channel(image, slice(20, 26), slice(6, 12)) == 2
-    assert image[:6, 22:, 3].max() == 0  # and nothing is at the upper right
 
 
 def test_projected_points_land_where_the_renderer_draws_them():

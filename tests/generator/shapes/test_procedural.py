@@ -1,7 +1,6 @@
 """Laws of the procedural objects: sound geometry, one connected thing, a function of its category and seed only."""
 
 import functools
-import hashlib
 
 import numpy as np
 import pytest
@@ -22,15 +21,10 @@ def asset(request):
 every_asset = pytest.mark.parametrize("asset", CASES, indirect=True, ids=lambda case: f"{case[0]}-{case[1]}")
 
 
-def digest(asset):
-    """Hash of every array of an object."""
-    state = hashlib.sha256()
-    for part in asset.parts:
-        material = part.material
-        arrays = (part.positions, part.faces, part.normals, part.texcoords)
-        for array in (*arrays, material.base_color, material.roughness, material.metallic):
-            state.update(np.ascontiguousarray(array).tobytes())
-    return state.hexdigest()
+def content(asset):
+    """The bytes of every array of an object."""
+    records = (record for part in asset.parts for record in (vars(part), vars(part.material)))
+    return b"".join(x.tobytes() for record in records for x in record.values() if isinstance(x, np.ndarray))
 
 
 def triangles(asset):
@@ -89,7 +83,7 @@ def test_every_part_touches_the_rest(asset):
 
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_a_seed_gives_the_same_bytes_again_and_other_seeds_other_shapes_and_colours(category):
-    assert digest(make(category, 3)) == digest(made(category, 3))
-    assert len({digest(made(category, seed)) for seed in SEEDS}) == len(SEEDS)
+    assert content(make(category, 3)) == content(made(category, 3))
+    assert len({content(made(category, seed)) for seed in SEEDS}) == len(SEEDS)
     shapes = {tuple(np.ptp(triangles(made(category, seed)).reshape(-1, 3), axis=0).round(4)) for seed in SEEDS}
     assert len(shapes) == len(SEEDS)

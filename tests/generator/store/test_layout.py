@@ -11,27 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import tiny_dataset
 from support.folders import contents
 
 from data_gen.store import check, layout
 from spnr_jax.formats import data_sets
 
 
-def made_up_record(views=2, resolution=8, num_points=20, seed=0):
-    rng = np.random.default_rng(seed)
-    points = np.zeros(num_points, layout.POINT_TYPE)
-    for name in layout.POINT_FIELDS:
-        points[name] = rng.random(num_points)
-    points["face"] = rng.integers(0, 2**30, num_points)
-    pictures = rng.integers(0, 256, (2, views, resolution, resolution, 4), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (views, 1, 1))
-    return layout.ObjectRecord(
-        points=points,
-        transforms=layout.nerf_transforms(poses, resolution, 40.0, 11.0),
-        images=pictures[0],
-        conditions=pictures[1],
-        details={"id": "made_up", "category": "object", "ignored": []},
-    )
+def made_up_record(seed=0):
+    return tiny_dataset.ball(seed, size=8)
 
 
 def test_an_object_reads_back_as_it_was_written(tmp_path):
@@ -52,7 +40,7 @@ def test_equal_objects_are_equal_bytes_and_each_file_has_its_checksum(tmp_path):
     checksums = {name: hashlib.sha256(made).hexdigest() for name, made in found.items() if name != "object.json"}
     assert json.loads(found["object.json"])["files"] == checksums
     assert set(checksums) == {"points.ply", "transforms.json"} | {
-        f"{kind}/00{view}.png" for kind in ("images", "conditions") for view in (0, 1)
+        f"{kind}/00{view}.png" for kind in ("images", "conditions") for view in range(tiny_dataset.VIEWS)
     }
 
 
