@@ -36,20 +36,13 @@ def test_cameras_that_were_written_far_from_the_origin_are_read_again(tmp_path, 
         assert (other.height, other.width) == (one.height, one.width)
 
 
-def test_an_angle_of_view_gives_the_focal_length_and_distortion_is_said(tmp_path):
-    document = {"camera_angle_x": 0.7, "w": 24, "h": 20, "k1": 0.1}
-    document["frames"] = describe_cameras(cameras(), ["a", "b"], np.eye(3), np.zeros(3))["frames"]
-    lines: list[str] = []
+def test_an_angle_of_view_gives_the_focal_length_distortion_is_said_and_cameras_without_a_size_are_square(tmp_path):
+    frames, lines = describe_cameras(cameras(), ["a", "b"], np.eye(3), np.zeros(3))["frames"], []
+    document = {"camera_angle_x": 0.7, "w": 24, "h": 20, "k1": 0.1, "frames": frames}
     for one, other in zip(cameras(), read_cameras(write(tmp_path, document), report=lines.append), strict=True):
         np.testing.assert_allclose(other.intrinsics, one.intrinsics, rtol=1e-6)
     assert lines == ["lens distortion is left out: pinhole cameras are drawn"]
-
-
-def test_the_original_nerfs_file_has_square_cameras_of_any_size(tmp_path):
-    frames = describe_cameras(cameras(), ["a", "b"], np.eye(3), np.zeros(3))["frames"]
-    names = ("file_path", "transform_matrix")
-    document = {"camera_angle_x": 0.7, "frames": [{name: frame[name] for name in names} for frame in frames]}
-    one, _ = read_cameras(write(tmp_path, document), size=100)
+    one, _ = read_cameras(write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}), size=100)  # as NeRF wrote it
     assert (one.width, one.height) == (100, 100)
     focal = 50 / np.tan(0.35)
     np.testing.assert_allclose(one.intrinsics, [[focal, 0, 50], [0, focal, 50], [0, 0, 1]], rtol=1e-6)

@@ -33,6 +33,7 @@ PICTURED = [(i // 20, i % 20, *row) for i, row in enumerate(ROWS)]
 WORDY = "point,x,y,z,r,g,b\nP" + table(",", columns=INDEXED).replace("\n", "\nP")[:-1]
 OPAQUE = [(*row[:3], 0xFF << 24 | GREEN[0] << 16 | GREEN[1] << 8 | GREEN[2]) for row in ROWS]
 PCL = "VERSION .7\nCOLUMNS x y z rgb\nsize 4 4 4 4\nTYPE F F F F\nPOINTS 420\nDATA ASCII\n"
+SIZES = "WIDTH 20\nHEIGHT 21", "WIDTH 420\nHEIGHT 0"
 NORTHING = [(row[1], row[0], *row[2:]) for row in ROWS]
 DOUBLES, POINTS = [(axis, "double") for axis in "xyz"], [tuple(point) for point in BALL.tolist()]
 COMMA_PLY = ply_bytes("ascii", rows=POINTS, properties=DOUBLES).replace(b".", b",").replace(b"1,0\n", b"1.0\n", 1)
@@ -53,7 +54,6 @@ TEXTS = {
     "remarks before and among the rows": ("a.txt", "# scanned on Monday\n# x y z r g b\n" + table(" ", "\n# row")),
     "a remark that names an axis": ("a.txt", "// the x axis points to the right\n" + table(" ")),
     "columns in another order": ("a.txt", "//420 points\nb g r z y x\n" + table(" ", columns=BACKWARDS)),
-    "count line": ("a.xyz", "420\n" + table(" ")),
     "CloudCompare, count": ("a.txt", "//X Y Z R G B\n420\n" + table(" ")),
     "CloudCompare, names with blanks": ("a.txt", "//X;Y;Z;R;G;B;Illuminance (PCV)\n" + table(";", columns=PCV)),
     "a number before each point": ("a.csv", table(",", columns=INDEXED)),
@@ -147,6 +147,7 @@ TEXTS = {
     "row and column in a scanner's picture": ("a.xyz", table(" ", columns=PICTURED)),
     "a row of the largest numbers": ("a.xyz", table(" ") + 3 * "3.40282e+38 " + "1 2 3\n"),
     "ASCII PCD, packed colours as whole numbers of a float": ("a.pcd", PCL + table(" ", columns=OPAQUE)),
+    **{f"PCD, {size}": ("a.pcd", PCL.replace("POINTS 420", size) + table(" ", columns=OPAQUE)) for size in SIZES},
     "grey: OBJ of v and p": ("a.obj", POINT_LINES + "p " + " ".join(map(str, range(1, 421)))),
     "grey: UTF-16 OBJ": ("a.obj", POINT_LINES.encode("utf-16")),
     "grey: OFF without its word": ("a.off", "420 0 0\n" + table(" ", columns=POINTS)),

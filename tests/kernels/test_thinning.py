@@ -63,10 +63,6 @@ def test_many_farthest_points_are_those_of_the_loop_over_all(moved):
     np.testing.assert_array_equal(farthest_points(positions, count, seed=7), kept)
 
 
-def test_points_that_coincide_are_never_kept_twice():
-    assert sorted(farthest_points(np.zeros((9, 3)), 9, seed=0)) == list(range(9))
-
-
 def pieces_of(positions: np.ndarray, size: int):
     """Columns with the row number as `tag`, `size` points at a time."""
     table = np.column_stack([positions, np.arange(len(positions))])

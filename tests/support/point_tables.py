@@ -50,22 +50,6 @@ def compress_lzf(data: bytes) -> bytes:
     return out
 
 
-def pcd_content(encoding: str, rows: np.ndarray, newline: str = "\n", stored: bool = False) -> bytes:
-    """A PCD file of the points in an encoding; what should be compressed may be stored as it is."""
-    header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
-    header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", f"WIDTH {len(rows)}", "HEIGHT 1"]
-    header += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", f"DATA {encoding}", ""]
-    head = newline.join(header).encode()
-    if encoding == "ascii":
-        lines = [" ".join(repr(float(value)) for value in np.hstack([np.ravel(cell) for cell in row])) for row in rows]
-        return head + newline.join([line.replace(".0 ", " ") for line in lines] + [""]).encode()
-    if encoding == "binary":
-        return head + rows.tobytes()
-    plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
-    body = plain if stored else compress_lzf(plain)
-    return head + np.array([len(body), len(plain)], "<u4").tobytes() + body
-
-
 def as_ply(form: str, newline: str = "\n"):
     names = ["z", "red", "x", "label", "green", "y", "blue", "roughness"]
     kinds = {"red": "uchar", "green": "uchar", "blue": "uchar", "label": "short"}
@@ -80,13 +64,26 @@ def as_ply(form: str, newline: str = "\n"):
 
 
 def as_pcd(encoding: str, newline: str = "\n", stored: bool = False):
+    """A writer of PCD files in an encoding; what should be compressed may be stored as it is."""
+    header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y _ z rgb roughness"]
+    header += ["SIZE 4 4 1 4 4 8", "TYPE F F U F F F", "COUNT 1 1 3 1 1 1", "WIDTH 12", "HEIGHT 1"]
+    header += ["VIEWPOINT 0 0 0 1 0 0 0", "POINTS 12", f"DATA {encoding}", ""]
+    head = newline.join(header).encode()
+
     def content(table):
         rows = np.zeros(12, PCD_FIELDS)
         with np.errstate(over="ignore"):
             rows["x"], rows["y"], rows["z"] = table.positions.T
         rows["rgb"] = (table.levels @ [1 << 16, 1 << 8, 1]).astype(np.uint32).view(np.float32)
         rows["roughness"] = table.roughness
-        return pcd_content(encoding, rows, newline, stored)
+        if encoding == "binary":
+            return head + rows.tobytes()
+        if encoding == "ascii":
+            texts = (" ".join(repr(float(x)) for cell in row for x in np.ravel(cell)) + newline for row in rows)
+            return head + "".join(text.replace(".0 ", " ") for text in texts).encode()
+        plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
+        body = plain if stored else compress_lzf(plain)
+        return head + np.array([len(body), len(plain)], "<u4").tobytes() + body
 
     return content
 
