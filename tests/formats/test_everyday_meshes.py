@@ -11,7 +11,6 @@ from support.point_clouds import GREEN, LINEAR, read, write
 
 from spnr_jax.formats.clouds import read_cloud
 from spnr_jax.kernels.imaging import srgb_to_linear
-from spnr_jax.kernels.triangles import ears
 
 
 def test_an_l_of_one_face_keeps_its_notch(tmp_path):
@@ -22,37 +21,6 @@ def test_an_l_of_one_face_keeps_its_notch(tmp_path):
         cloud = read_cloud(write(tmp_path, name, content), num_points=1000)
         assert not (cloud.positions[:, :2] > 0.501).all(axis=1).any()
         assert (cloud.positions[:, 1] > 0.5).mean() == pytest.approx(0.75 / 1.75, abs=0.05)
-
-
-def test_a_polygon_with_a_bridge_to_its_hole_leaves_the_hole_empty_wherever_it_begins():
-    outer, hole = [(0, 0), (4, 0), (4, 4), (0, 4)], [(1, 1), (1, 3), (3, 3), (3, 1)]
-    corners = np.array([(*corner, 0) for corner in [*outer, outer[0], *hole, hole[0]]], float)
-    for roll in range(len(corners)):
-        rolled = np.roll(corners, roll, axis=0)
-        a, b, c = np.moveaxis(rolled[ears(rolled)], 1, 0)
-        assert np.abs(np.cross(b - a, c - a)[:, 2]).sum() / 2 == pytest.approx(16 - 4)
-        middles = ((a + b + c) / 3)[np.abs(np.cross(b - a, c - a)[:, 2]) > 0]
-        assert not (np.abs(middles[:, :2] - 2) < 1).all(axis=1).any()
-
-
-def test_corners_of_a_polygon_that_are_named_twice_change_nothing():
-    angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
-    star = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * np.where(np.arange(10) % 2, 0.4, 1)[:, None]
-    for number in range(20):
-        doubled = np.repeat(star, 1 + np.random.default_rng(number).integers(0, 2, 10), axis=0)
-        a, b, c = np.moveaxis(doubled[ears(doubled)], 1, 0)
-        twice = np.cross(b - a, c - a)[:, 2]
-        assert (twice > -1e-12).all()
-        assert twice.sum() == pytest.approx(np.cross(star, np.roll(star, -1, axis=0))[:, 2].sum())
-
-
-def test_a_wavy_polygon_of_many_corners_keeps_its_area():
-    angle = np.linspace(0, 2 * np.pi, 900, endpoint=False)
-    corners = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * (1 + 0.3 * np.cos(40 * angle))[:, None]
-    a, b, c = np.moveaxis(corners[ears(corners)], 1, 0)
-    twice = np.cross(b - a, c - a)[:, 2]
-    assert (twice > 0).all()
-    assert twice.sum() == pytest.approx(np.cross(corners, np.roll(corners, -1, axis=0))[:, 2].sum())
 
 
 def test_an_stl_is_read_by_its_size_and_words_whatever_its_beginning_and_its_count_say(tmp_path):
