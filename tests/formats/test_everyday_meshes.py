@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.mesh_files import CORNERS, RGB, square_ply, stl
+from support.mesh_files import CORNERS, RGB, TEXCOORDS, TEXTURE, TWO_SQUARES, UNIT_UV, square_ply, stl, two_squares_ply
 from support.point_clouds import GREEN, LINEAR, read, write
 
 from spnr_jax.formats.clouds import read_cloud
@@ -54,10 +54,6 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
     assert (cloud.positions[:, 1] >= cloud.positions[:, 0]).all()
     assert "1 face left out for the alpha of their vertices, near 0" in lines
     assert not any("alpha" in line for line in read(write(tmp_path, "a.off", hidden.replace(" 1\n", " 0\n")))[1])
-
-
-TWO_SQUARES = "".join(f"v {x} {y} {z}\n" for z in (0, 5) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
-TEXCOORDS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 
 
 def textured_obj(folder: Path, image: str, mtl: bytes) -> Path:
@@ -169,33 +165,20 @@ def test_an_obj_goes_on_in_the_next_line_behind_a_backslash_but_not_in_a_remark(
         assert np.ptp(cloud.positions, axis=0) == pytest.approx([1, 1, 0], abs=0.2)
 
 
-PLY_HEAD = "ply\nformat ascii 1.0\n{}element vertex 8\n" + "".join(f"property float {x}\n" for x in "xyz")
-
-
-def two_squares_ply(comments: str, of_vertex: str, of_face: str, vertex: str, faces: list[str]) -> str:
-    """A PLY of a square at z 0 and one at z 5 with further properties, `vertex` those of each vertex."""
-    head = PLY_HEAD.format(comments) + of_vertex + "element face 2\nproperty list uchar int vertex_indices\n"
-    rows = "".join(f"{line[2:]} {vertex}\n" for line in TWO_SQUARES.splitlines())
-    rows += "".join(f"4 {' '.join(str(4 * i + j) for j in range(4))} {face}\n" for i, face in enumerate(faces))
-    return f"{head}{of_face}end_header\n{rows}"
-
-
 @pytest.mark.parametrize("number", [-1, 7])
 def test_faces_of_a_ply_that_show_no_image_are_drawn_in_their_own_colours(tmp_path, number):
     Image.new("RGB", (4, 4), GREEN).save(tmp_path / "wood.png")
-    of_face = "property list uchar float texcoord\nproperty int texnumber\n"
-    uv = "8 0 0 1 0 1 1 0 1"
     for missing in ("wood.png", "gone.png"):
         comments = f"comment TextureFile wood.png\ncomment TextureFile {missing}\n"
-        faces = [f"{uv} 0", f"{uv} {number if missing == 'wood.png' else 1}"]
-        cloud, lines = read(write(tmp_path, "a.ply", two_squares_ply(comments, "", of_face, "", faces)), num_points=400)
+        faces = [f"{UNIT_UV} 0", f"{UNIT_UV} {number if missing == 'wood.png' else 1}"]
+        cloud, lines = read(write(tmp_path, "a.ply", two_squares_ply(comments, "", TEXTURE, "", faces)), num_points=400)
         low = cloud.positions[:, 2] < 1
         assert np.mean(low) == pytest.approx(0.5, abs=0.05)
         assert is_green(cloud.replace(base_color=cloud.base_color[low]))
         assert (cloud.base_color[~low] == 0.5).all()
         assert "1 of 2 faces show no image of the file: their own colours taken" in lines
-    faces = [f"{uv} 1", f"{uv} 1"]  # counted from 1
-    path = write(tmp_path, "a.ply", two_squares_ply("comment TextureFile wood.png\n", "", of_face, "", faces))
+    faces = 2 * [f"{UNIT_UV} 1"]  # counted from 1
+    path = write(tmp_path, "a.ply", two_squares_ply("comment TextureFile wood.png\n", "", TEXTURE, "", faces))
     assert is_green(read_cloud(path, num_points=50))
 
 

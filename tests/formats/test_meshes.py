@@ -7,7 +7,18 @@ import pytest
 import trimesh
 from PIL import Image
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder
-from support.mesh_files import TEXCOORDS, VERTICES, gltf_leaf, half_transparent, obj_leaf, refusal, write_obj
+from support.mesh_files import (
+    TEXCOORDS,
+    TEXTURE,
+    UNIT_UV,
+    VERTICES,
+    gltf_leaf,
+    half_transparent,
+    obj_leaf,
+    refusal,
+    two_squares_ply,
+    write_obj,
+)
 
 from data_gen.plan.sources import find_meshes
 from spnr_jax.errors import UserError
@@ -50,30 +61,19 @@ def test_a_grey_placeholder_does_not_darken_colours_of_vertices(tmp_path):
         assert ("MTL Kd beside colours of the vertices" in asset.ignored) == (np.ndim(expected) == 0)
 
 
-@pytest.mark.parametrize("form", ["faces", "vertices", "two images", "no image"])
-def test_a_ply_has_its_textures_by_face_or_by_vertex(tmp_path, form):
-    for i in (0, 1):
-        Image.fromarray(np.roll(CHECKER, i, axis=0)[..., :3].astype(np.uint8)).save(tmp_path / f"the image {i}.png")
-    texture = "comment TextureFile {}\n".format
-    names = {"two images": ("the image 0.png", "the image 1.png"), "no image": ("gone.png",)}
-    names = names.get(form, ("the image 0.png",))
-    flat, of_vertices = [(x, y, 0, x, y) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], form == "vertices"
-    head = "".join(["ply\nformat ascii 1.0\n", *map(texture, names), "element vertex 4\n"])
-    head += "".join(f"property float {name}\n" for name in ("x", "y", "z", *("st" if of_vertices else "")))
-    head += "element face 1\nproperty list uchar int vertex_indices\n"
-    head += "" if of_vertices else "property list uchar float texcoord\nproperty int texnumber\n"
-    rows = "".join(" ".join(map(str, row[: 5 if of_vertices else 3])) + "\n" for row in flat)
-    face = "4 0 1 2 3" + ("" if of_vertices else f" 8 0 0 1 0 1 1 0 1 {int(form == 'two images')}")
-    (tmp_path / "a.ply").write_text(f"{head}end_header\n{rows}{face}\n")
+def test_a_ply_has_its_textures_by_face_or_by_vertex(tmp_path):
+    Image.fromarray(CHECKER.astype(np.uint8)).save(tmp_path / "the image.png")
+    comment, of_vertex = "comment TextureFile the image.png\n", "property float s\nproperty float t\n"
+    by_face = two_squares_ply(comment, "", TEXTURE, "", 2 * [f"{UNIT_UV} 0"])
+    for content in (by_face, two_squares_ply(comment, of_vertex, "", "{0} {1}", ["", ""])):
+        (tmp_path / "a.ply").write_text(content)
+        (part,) = load_mesh(tmp_path / "a.ply").parts
+        np.testing.assert_array_equal(part.texcoords, part.positions[:, :2] * [1, -1] + [0, 1])
+        np.testing.assert_allclose(part.material.base_color, srgb_to_linear(CHECKER / 255), atol=1e-6)
+    (tmp_path / "the image.png").unlink()
     asset = load_mesh(tmp_path / "a.ply", transparent_parts="opaque")
-    points, (part,) = sample_surface(asset, 200, 0), asset.parts
-    if form == "no image":
-        assert any("missing: 'gone.png'" in note for note in asset.notes)
-        np.testing.assert_array_equal(points.base_color, 0.5)
-        return
-    np.testing.assert_array_equal(part.texcoords, part.positions[:, :2] * [1, -1] + [0, 1])
-    expected = srgb_to_linear(np.roll(CHECKER, int(form == "two images"), axis=0)[..., :3] / 255)
-    np.testing.assert_allclose(part.material.base_color, expected, atol=1e-6)
+    assert any("missing: 'the image.png'" in note for note in asset.notes)
+    np.testing.assert_array_equal(asset.parts[0].material.base_color, 0.5)
 
 
 # Real files

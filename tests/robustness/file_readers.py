@@ -20,6 +20,7 @@ import trimesh
 from PIL import Image
 from support import splat_balls, tiny_dataset
 from support.gltf_files import UV, GltfBuilder, instanced, png, skinned
+from support.mesh_files import TEXTURE, UNIT_UV, two_squares_ply
 from support.packed_meshes import draco_square, meshopt_files
 from support.point_clouds import packed_splats
 from support.point_tables import WHOLE, WRITERS, written
@@ -134,35 +135,14 @@ def tables(*suffixes: str) -> list[Files]:
     return found
 
 
-TEXTURED = b"""ply
-format ascii 1.0
-comment TextureFile a.png
-element vertex 4
-property float x
-property float y
-property float z
-property float s
-property float t
-element face 2
-property list uchar int vertex_indices
-property list uchar float texcoord
-property int texnumber
-end_header
-0 0 0 0 0
-1 0 0 1 0
-1 1 0 1 1
-0 1 0 0 1
-3 0 1 2 6 0 0 1 0 1 1 0
-3 0 2 3 6 0 0 1 1 0 1 0
-"""
-
-
 def plain_meshes(suffix: str) -> list[Files]:
-    """A box as trimesh writes it; of .ply also a textured square."""
+    """A box as trimesh writes it; of .ply also textured squares."""
     box, found = trimesh.creation.box(), []
     if suffix == ".ply":
         box.visual.face_colors = np.tile([40, 170, 60, 255], (len(box.faces), 1))
-        found = [{"mesh.ply": TEXTURED, "a.png": png(TEXELS[..., :3])}]
+        by_vertex, faces = "property float s\nproperty float t\n", 2 * [f"{UNIT_UV} 0"]
+        squares = two_squares_ply("comment TextureFile a.png\n", by_vertex, TEXTURE, "{0} {1}", faces)
+        found = [{"mesh.ply": squares.encode(), "a.png": png(TEXELS[..., :3])}]
     kinds = ("stl", "stl_ascii") if suffix == ".stl" else (suffix[1:],)
     contents = [box.export(file_type=kind) for kind in kinds]
     return [{f"mesh{suffix}": data if isinstance(data, bytes) else data.encode()} for data in contents] + found

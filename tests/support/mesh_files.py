@@ -105,6 +105,20 @@ def square_ply(kind: str, names, color, corners=SQUARE) -> str:
     return head + faces + rows + "3 0 1 2\n3 0 2 3\n"
 
 
+TWO_SQUARES = VERTICES + VERTICES.replace(" 0\n", " 5\n")
+TEXTURE, UNIT_UV = "property list uchar float texcoord\nproperty int texnumber\n", "8 0 0 1 0 1 1 0 1"  # of faces
+
+
+def two_squares_ply(comments: str, of_vertex: str, of_face: str, vertex: str, faces: list[str]) -> str:
+    """A PLY of squares at z 0 and 5 with further properties: `vertex` those of each vertex, {0} its x and {1} its y."""
+    head = f"ply\nformat ascii 1.0\n{comments}element vertex 8\n" + "".join(f"property float {x}\n" for x in "xyz")
+    head += f"{of_vertex}element face 2\nproperty list uchar int vertex_indices\n{of_face}end_header\n"
+    places = [line[2:].split() for line in TWO_SQUARES.splitlines()]
+    rows = [" ".join([*place, vertex.format(*place)]) for place in places]
+    rows += [f"4 {' '.join(str(4 * i + j) for j in range(4))} {face}" for i, face in enumerate(faces)]
+    return head + "\n".join([*rows, ""])
+
+
 def stl(count: int, tail: bytes = b"", at: np.ndarray = SQUARE[0]) -> bytes:
     """A binary STL file of two triangles."""
     triangles = [at + SQUARE[[0, 1, 2]], at + SQUARE[[0, 2, 3]]]
