@@ -75,6 +75,6 @@ def test_a_picture_needs_neither_the_paper_s_network_nor_what_trains_or_compares
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in SOURCES}
     drawing = loaded & files - {"spnr_jax.training.weights"}
     assert "spnr_jax.method.surfel_renderer" in drawing
-    others = {f"spnr_jax.{part}" for part in ("method.paper_method", "method.inference", "nn.paper", "nn.paper")}
+    others = {f"spnr_jax.{part}" for part in ("method.paper_method", "method.inference", "nn.paper_layers")}
     assert not drawing & others
     assert not {part for part in drawing if part.split(".")[1] in ("training", "scoring", "tools")}
