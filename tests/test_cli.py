@@ -40,8 +40,6 @@ def run():
 
 FILES = {
     "empty.ply": b"",
-    "noise.npz": b"PK\x03\x04 no zip",
-    "cloud.doc": b"\xd0\xcf\x11\xe0\x00\x00",
     "point.xyz": b"1 2 3\n",
     "three.xyz": b"1 2 3\n2 2 3\n1 3 3\n",
     "ball.xyz": "\n".join(f"{x} {y} {z}" for x, y, z in spiral(2000)).encode(),
@@ -63,8 +61,6 @@ REFUSED = [  # command, what its line says
     ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate the data set anew"),
     ("evaluate DATA .", "not a run folder (config.json is missing); train one with `spnr train DATA"),
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
-    ("render noise.npz --run RUN", "noise.npz"),
-    ("render cloud.doc --run RUN", "cloud.doc: unknown kind"),
     ("render point.xyz --run RUN", "holds 1 point in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),
     ("render a.ply b.ply b/a.xyz", "two clouds have one name"),
@@ -102,7 +98,6 @@ REFUSED = [  # command, what its line says
     ),
     ("evaluate UNTESTED RUN --split train --out ball.xyz", "ball.xyz is a file, not a folder; choose another place"),
     ("export RUN --light studio", "--light is for --splats"),
-    ("export RUN --sun 40 30", "--sun is for --splats"),
     ("export RUN --fitting-views 8", "--fitting-views is for --splats"),
     ("export RUN --up z", "--up is for --splats"),
     ("export ball.xyz --splats out.ply --out x", "--out is not for --splats"),

@@ -31,10 +31,10 @@ CHECKPOINT_EVERY, LONGEST_DELAY = 8, 0.3  # seconds: a checkpoint takes some ten
 LIMIT = 300.0  # seconds after which a process hangs
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(["spnr_jax.training.trainer", "spnr_jax.cli", "orbax.checkpoint.v1", "tensorboardX"])
-OPTIONS = (  # few weights; the discriminator takes part from the first step, so that its state counts too
+OPTIONS = (  # few weights; the discriminator joins before the second kill
     "--point-widths 8 --point-features 4 --volume-resolution 8 --base-width 4 --num-stages 1 --num-groups 2"
     " --field-width 8 --num-features 5 --direction-frequencies 1 --num-coarse 4 --num-fine 4 --render-resolution 24"
-    " --image-resolution 24 --discriminator-width 8 --adversarial-start 0 --r1-gamma 0 --lr-generator 1e-2"
+    " --image-resolution 24 --discriminator-width 8 --adversarial-start 0.25 --r1-gamma 0 --lr-generator 1e-2"
     " --warmup-steps 2 --batch-objects 2 --min-points 8 --max-points 32 --test-points 24"
     f" --log-every 2 --checkpoint-every {CHECKPOINT_EVERY} --preview-every 1000000 --num-steps {STEPS}"
 )
@@ -86,6 +86,7 @@ def test_a_training_that_was_killed_ends_with_the_same_bits_and_rows(whole):
     assert config == expected_config
     same_bits(state, expected)
     assert rows_without_time(run) == rows_without_time(whole)
+    assert f"step {STEPS // 4}: the discriminator joins" in whole.with_name("whole.txt").read_text()
 
 
 def test_a_second_training_in_one_folder_is_refused_until_the_first_is_over(tmp_path, capsys):
