@@ -120,7 +120,7 @@ PAINTED = f"{VERTICES}usemtl paint\nf 1 2 3 4\n"
 TEXTURED = f"{VERTICES}{TEXCOORDS}vn 0 0 2\nusemtl paint\nf 1/1/1 2/2/1 3/3/1 4/4/1\n"
 
 
-SQUARES = "f 1 2 3 4\n", "f 1 2 3\nf 1 3 4\n", "f -4 -3 -2 -1\n", "\tf\t1 2 3\n  f 1 3 4\n", "f 1 2 3 \\\n4\n"
+SQUARES = "f 1 2 3 4\n", "f 1 2 3\nf 1 3 4\n", "f -4 -3 -2 -1\n", "\tf\t1 2 3\n  f 1 3 4\n"
 
 
 @pytest.mark.parametrize("faces", SQUARES)

@@ -1,7 +1,7 @@
 """Meshes that other encoders packed: meshoptimizer 1.3 (npm), and Draco.
 
 MESHOPT    name -> packed, mode, count, byteStride, filter as in the glTF extension; `plain` is what meshoptimizer's own
-           decoder makes of it, `meant` the floats that went into a filter
+           decoder makes of it
 """
 
 import base64
@@ -14,7 +14,7 @@ import pytest
 from support.gltf_files import CORNERS, SQUARE, GltfBuilder
 
 MESHOPT = {
-    name: case | {key: base64.b64decode(case[key]) for key in ("packed", "plain", "meant") if key in case}
+    name: case | {key: base64.b64decode(case[key]) for key in ("packed", "plain")}
     for name, case in json.loads(Path(__file__).with_name("meshopt_packed.json").read_text()).items()
 }
 COLORS = np.array([[255, 0, 51], [255, 0, 51], [0, 255, 0], [0, 0, 255]], np.uint8)
