@@ -12,14 +12,12 @@ import pytest
 
 from spnr_jax.devices import programs
 
-QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-
 
 @pytest.mark.ci
 def test_eight_devices_train_as_one_in_float64_and_go_on_from_its_checkpoint(tmp_path):
     here = Path(__file__).parent
     environment = os.environ | {
-        "XLA_FLAGS": f"{QUICK_COMPILATION} --xla_force_host_platform_device_count=8",
+        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=8",
         "PYTHONPATH": str(here.parents[1]),
     }
     command = [sys.executable, here / "many_devices.py", tmp_path]
