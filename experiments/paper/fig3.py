@@ -79,7 +79,7 @@ def main(options: Fig3) -> None:
     dataset = data_sets.open_dataset(options.data)
     names = test_objects(dataset, 2 if options.quick else options.objects, options.points)
     found = all_methods(options.runs)
-    asked = {"runs": checksums(options.runs), "points": options.points, "objects": names}
+    asked = {"runs": checksums(options.runs), "points": options.points, "objects": names, "normals": False}
     results_folder.claim(options.out, "depths", asked, dataset)
     rows = {name: partial(measure, options.points, method) for name, method in found.items()}
     shown = evaluation.pick_evenly(names, options.shown)

@@ -34,6 +34,13 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         if magic.startswith(b"PK"):
             arrays = read_arrays(file, (*PLACES.split(), "v", *ARRAYS, *UNNAMED), report)
             tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
+            if "v" in tables and tables.keys() & {
+                *PLACES.split(),
+                *UNNAMED,
+                *POSITION,
+            }:  # only alone does it hold places
+                report("arrays that are not used: v")
+                del tables["v"]
             yield _archive_columns(tables, report)
             return
     broken = "is a broken, truncated or pickled NumPy file: save arrays, as np.savez(file, points=..., colors=...)"
@@ -102,9 +109,7 @@ def read_arrays(
 def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
     """The columns of named arrays (points, c) or (points,), and of unnamed ones that are as long."""
     columns: Columns = {}
-    name = next((name for name in (*PLACES.split(), "v", "arr0") if name in arrays), "")
-    alone = [arrays[axis].shape for axis in POSITION if axis in arrays]  # x y z of as many points stand for themselves
-    if name and alone != 3 * [arrays[name].shape[:1]]:
+    if name := next((name for name in (*PLACES.split(), "arr0", "v") if name in arrays), None):
         table = np.atleast_2d(arrays.pop(name))
         unnamed = [arrays.pop(other) for other in UNNAMED if other in arrays]
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]

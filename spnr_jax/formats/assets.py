@@ -31,7 +31,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy.ndimage import map_coordinates
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import LONGEST_NAME
+from spnr_jax.formats.columns import LONGEST_NAME, ROUNDING
 from spnr_jax.kernels.imaging import srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -298,9 +298,10 @@ def decode_image(data: bytes) -> np.ndarray:
         raise ValueError("is not an image") from None
     if image.width * image.height > MOST_PIXELS:  # before allocating them
         raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
-    if image.mode[0] in "IF":  # Pillow clips grey of 16 bits, or of floats 0 to 1, to 255 instead of scaling it
-        levels = np.asarray(image) * (255 if image.mode == "F" else 1 / 257)
-        image = Image.fromarray(np.round(np.clip(levels, 0, 255)).astype(np.uint8))
+    if image.mode[0] in "IF":  # Pillow clips grey of 16 bits or floats to 255 instead of scaling it
+        levels = np.nan_to_num(np.asarray(image))
+        white = 65535 if image.mode != "F" else 1 if levels.max() <= 1 + ROUNDING else 255
+        image = Image.fromarray(np.round(np.clip(levels * (255 / white), 0, 255)).astype(np.uint8))
     return np.asarray(image.convert("RGBA"))
 
 

@@ -71,6 +71,7 @@ DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
 STRAYS, LEAST = 1000, 100  # one outlier in STRAYS values is allowed, if there are at least LEAST
+PERCENT = 10  # of roughness or metallic: the largest value from which all are percent
 DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of black colours that is reported
 BRIGHTEST = 0.99  # quantile of the intensities shown as white; its complement is shown as black
 LEAST_GREY = 0.5 / 255
@@ -88,7 +89,9 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
     columns: Columns = {}
     for name, values in fields.items():
         width = values.shape[1] if values.ndim == 2 else 1
-        own = name if name.lower() in columns else name.lower()  # of names that differ in letters the first is read
+        own = name.lower()
+        if columns.keys() & {own, f"{own}:0"}:  # of names that differ in letters the first is read
+            own = f"{name} (again)"
         if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
             several = {f"{own}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
             columns |= several or {own: values.reshape(-1)}
@@ -259,8 +262,9 @@ def base_color(columns: Columns, report: Report) -> np.ndarray | None:
 def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
     """Roughness or metallic in [0, 1], or of percent or whole bytes; ValueError if they lie outside."""
     highest = float(values.max(initial=0))
-    percent, fractions = values.dtype != np.uint8 and 10 < highest <= 100, bool((values % 1).any())
-    scale = 100.0 if percent else full_scale(values.dtype, highest, fractions or not 100 < highest <= 255)
+    percent = values.dtype.kind != "u" and PERCENT < highest <= 100 and not ((values > 0) & (values < 1)).any()
+    whole = 100 < highest <= 255 and not (values % 1).any()
+    scale = 100.0 if percent else full_scale(values.dtype, highest, linear=not whole)
     if scale > 1:
         report(f"{name} taken to be in 0..{scale:g}")
     scaled = values / scale
@@ -288,7 +292,7 @@ def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
 def _unpack(packed: np.ndarray) -> np.ndarray:
     """Red, green, blue and alpha (n, 4) uint8 of numbers (n,) 0xAARRGGBB, or of floats with these bits (PCL)."""
     if packed.dtype == np.float64:  # holds all 32-bit integers, signed or not
-        packed = np.nan_to_num(packed, nan=0xFF << 24)  # black
+        packed = np.nan_to_num(packed)
     whole = bool(((packed % 1 == 0) & (np.abs(packed) < 2**32)).all())  # floats made of a colour's bits are tiny or NaN
     if packed.dtype.kind != "f" or whole:
         bits = packed.astype(np.int64).astype(np.uint32)

@@ -37,9 +37,9 @@ NEARLY_GREY = 16  # of 255: largest difference between the channels of a grey JP
 READ = {"kd", "pr", "pm", "ns", "d", "tr", "blender", *MAPS}
 SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # Phong parameters without a principled counterpart
 SHININESS = re.compile(r"\s*# Blender( MTL)?")  # Blender: Ns = 1000 (1 - roughness)^2, formerly 900
-OPTION = re.compile(
-    r"(?<!\S)-([a-z]\w*)((?:\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?=\s))+)\s+"
-)
+WORD = r"\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?!\S)"
+OPTION = re.compile(rf"-(\w+)((?:{WORD})*)\s+")
+BEHIND = re.compile(rf"^(.*?)((?:\s+-[a-z]\w*(?:{WORD})+)+)$")  # a file's name, then its options
 
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
@@ -223,10 +223,11 @@ def _look(name: str, entry: dict[str, str] | None, loading: Loading) -> Look:
     move = UNMOVED
     wrap: assets.Wrap = "repeat"
     for key in MAPS:
-        statement = entry.get(key, "") + " "  # options stand before the file's name, in some files behind it
-        options = {option: words.split() for option, words in OPTION.findall(statement)}
+        statement, options, place = BEHIND.sub(r"\2 \1", entry.get(key, "")).strip(), {}, 0
+        while option := OPTION.match(statement, place):
+            options[option[1]], place = option[2].split(), option.end()
         ignored |= {f"MTL map option -{option}" for option in options if option not in ("clamp", "s", "o")}
-        file = OPTION.sub("", statement).strip("\"' \t").replace("\\", "/")
+        file = statement[place:].strip("\"' \t").replace("\\", "/")
         if key in entry and (texels := loading.read_image(file)) is not None:
             own = _pair(options.get("s", ()), 1.0), _pair(options.get("o", ()), 0.0)
             if maps and own != move:

@@ -44,7 +44,7 @@ THOUSANDS = (
     re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"),
 )
 PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
-PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})((?<=#.{6})[0-9a-f]{2})?\s*", re.IGNORECASE)  # colour and alpha
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})((?<=#.{6})ff)?\s*", re.IGNORECASE)  # colour, opaque
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 DECIMAL = re.compile(r"(?<!\d)0,|,(?!\d{3}(?!\w))")  # a comma that separates no thousands
@@ -96,7 +96,7 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
                     raise broken
                 names = _name_words(names, table, words)
                 _report_cut_numbers(names, table, report)
-            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgba")
+            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgb")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         _report_counts(counted, report)
 
@@ -135,10 +135,10 @@ def _load_table(rows: list[Line], head: Head, words: Collection[int]) -> np.ndar
 
 
 def _name_words(names: tuple[str, ...], table: np.ndarray, words: Collection[int]) -> tuple[str, ...]:
-    """The names with those of columns of words marked; the first that holds colours is `rgba`."""
+    """The names with those of columns of words marked; the first that holds colours is `rgb`."""
     of_words = {i: f"{names[i]} (words)" for i in words}
     hexadecimal = [i for i in sorted(words) if np.isfinite(table[:, i]).any() and COLORED.search(names[i])]
-    of_words |= dict.fromkeys(hexadecimal[:1], "rgba")
+    of_words |= dict.fromkeys(hexadecimal[:1], "rgb")
     return tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
 
 
@@ -202,7 +202,7 @@ def _plain(line: str) -> str:
     if PLAIN.fullmatch(text := line.strip()):
         return text
     text = text.strip("|").strip().replace("|", ";").replace("\N{MINUS SIGN}", "-")
-    text = re.sub(r"^[\w.= ]+\(?(?=\[\[)", "", text)  # array([[ of NumPy
+    text = re.sub(r"^[^\W\d][\w.= ]*\(?(?=\[\[)", "", text)  # array([[ of NumPy
     if text[:1] in ("[", "(", "{") and not ONE_IN_BRACKETS.match(text):
         text = re.sub(r"[][(){}]", " ", text).strip(" ,;")
     if '"' in text:
@@ -233,8 +233,8 @@ def _are_cut(values: np.ndarray) -> bool:
 
 
 def _packed_color(word: str) -> float:
-    """The number 0xAARRGGBB of a word #rrggbb or #rrggbbaa, NaN for other words."""
-    return float(int((found[2] or "ff") + found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
+    """The number 0xRRGGBB of a word #rrggbb, NaN for other words."""
+    return float(int(found[1], 16)) if (found := PACKED.fullmatch(word)) else np.nan
 
 
 def _is_number(word: str) -> bool:
@@ -336,8 +336,9 @@ def _split_names(text: str, filled: int, count: int) -> list[str]:
     names = [name.lower() for name in _words(text)]
     if "\t" in text and not filled <= len(names) <= count:  # tabs used as blanks
         names = text.lower().split()
-    if len(names) == 1 and ONE_WORD.fullmatch(names[0]):
-        names = [name.replace("i", "intensity") for name in re.findall("n?.", names[0])]
+    letters = re.findall("n?.", names[0]) if len(names) == 1 and ONE_WORD.fullmatch(names[0]) else []
+    if filled <= len(letters) <= count:
+        names = [name.replace("i", "intensity") for name in letters]
     while len(names) > filled and not names[-1]:
         names.pop()
     return names

@@ -159,7 +159,7 @@ def colored_part(
     Vertices of one colour beside polygons of several do not count.
     """
     columns = useful(vertices)
-    loading.say(*describe_use(vertices))
+    loading.say(*describe_use({name: x for name, x in vertices.items() if name not in sum(TEXCOORDS, ())}))
     positions = stack_columns(columns)
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None

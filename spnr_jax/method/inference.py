@@ -119,7 +119,7 @@ def render_each(
     lights: Sequence[Light | None],
     *,
     config: NetworkConfig,
-    quality: str,
+    quality: str = "trained",
 ) -> Iterator[Rendering]:
     """Views one after the other.  UserError for a light, or for odd sizes if the network doubles the resolution."""
     check_kind(volume, Volume, "render: expected a volume of this network's Model.encode")

@@ -88,10 +88,10 @@ class PaperNetwork(nn.Module):
         occupied = jax.vmap(partial(voxels.mark_occupied, resolution=self.config.encoder.volume_resolution))
         return Scene(volume=volume, occupied=occupied(jnp.asarray(cloud.positions), jnp.asarray(cloud.mask)))
 
-    def render(self, scene: Scene, camera: Camera, block: int | None = None) -> Rendering:
-        """Views of encoded objects, `block` rays at a time; the camera's size is that of the image."""
+    def render(self, scene: Scene, camera: Camera) -> Rendering:
+        """Views of encoded objects, some rays at a time; the camera's size is that of the image."""
         samples = self.config.sampling
-        block = block or (None if samples.reach else WHOLE_BLOCK)
+        block = None if samples.reach else WHOLE_BLOCK
         return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, block, None))
 
     def rays(self, camera: Camera) -> Rays:

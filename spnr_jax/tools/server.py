@@ -168,7 +168,7 @@ class Browser:
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
         self._light: dict[str, Any] = {}
-        self._opening = threading.Lock()  # one file after the other: the last stays
+        self._newest: viser.UploadedFile | None = None  # the file that was opened last stays
         self.loop = Loop(first, lambda state, moving: self._try(lambda: self._draw(state, moving)))
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
@@ -295,15 +295,17 @@ class Browser:
             light = frame.read_upload(file.name, file.content, images.read_light)
             self.loop.submit(lambda state: self._show_choice(frame.add_map(state, name, light)))
             return
+        self._newest = file
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)
         opening = self._client.add_notification("Opening", name, loading=True, with_close_button=False)
         try:
-            with self._opening:
-                cloud = frame.read_upload(file.name, file.content, read)
-                self._replace(name=name, cloud=cloud, volume=self._model.encode(cloud))
-                self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
+            cloud = frame.read_upload(file.name, file.content, read)
+            volume = self._model.encode(cloud)
         finally:
             opening.remove()
+        if file is self._newest:
+            self._replace(name=name, cloud=cloud, volume=volume)
+            self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 
     def _show_choice(self, state: State) -> State:
         self._light["choice"].options, self._light["choice"].value = state.lights, state.light_name

@@ -169,7 +169,7 @@ SEEN = {  # columns of the ball, points that are left, what a line says
     "noise of CloudCompare": ({"scalar_Classification": np.where(PART, 7.0, 2.0)}, ~PART, HIDDEN),
     "noise": ({"classification": np.where(PART, 18, 6).astype(np.uint8)}, ~PART, HIDDEN),
     "withheld": ({"withheld": PART.astype(np.uint8)}, ~PART, HIDDEN),
-    "a name in other letters": ({"Red": PART, "label": PART, "Label": PART}, ..., ".* Red, label, La"),
+    "a name in other letters": ({"Red": PART, "label": PART, "Label": PART}, ..., ".* Red .again., l"),
     "alpha 0 everywhere": ({"alpha": np.zeros(420, np.uint8)}, ..., "red green blue taken"),
     "noise everywhere": ({"classification": np.full(420, 7, np.uint8)}, ..., "all points kept, though"),
     "splats without a number": (F_DC | {"opacity": np.where(PART, np.nan, 3.0)}, ~PART, BROKEN),

@@ -153,7 +153,7 @@ LINEAR = srgb_to_linear(CHECKER / 255)
 PLACEHOLDER = "Kd 0.8 0.8 0.8\nmap_Kd -s 2 -.5 1e-1 -clamp on 3d wood.png"
 LOOKS = [  # statements; base colour, roughness, metallic, wrap mode; what is ignored
     (PLACEHOLDER, (LINEAR, 0.5, 0, "clamp"), ("MTL Kd beside map_Kd",)),
-    ("map_Kd 3d wood.png -clamp on -s 2 2 2", (LINEAR, 0.5, 0, "clamp"), ()),
+    ("map_Kd -S 1 1 1 3d wood.png -clamp on -s 2 2 2", (LINEAR, 0.5, 0, "clamp"), ("MTL map option -S",)),
     ("Kd 0.1 0.2 0.3\nNs 98\nKs 0 0 0", (np.float32([0.1, 0.2, 0.3]), 0.5, 0, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nPr 0.25\nPm 0.75\nNs 10", (np.float32([0.1, 0.2, 0.3]), 0.25, 0.75, "repeat"), ()),
     ("Kd 0.1 0.2 0.3\nNs 98\nd 1\nTr 0", (np.float32([0.1, 0.2, 0.3]), np.sqrt(2 / 100), 0, "repeat"), ()),

@@ -75,7 +75,7 @@ TEXTS = {
     "thousands, German": ("a.txt", table(";", columns=THOUSANDS).translate({44: ".", 46: ","})),
     "thousands, in quotes": ("a.csv", '"' + table('","', '"', columns=THOUSANDS).replace("\n", '\n"')[:-1]),
     "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
-    "packed colours and alpha": ("a.csv", "x,y,z,hex\n9,9,9,#28aa3c00\n" + table(",", ",#28AA3Cff", columns=POINTS)),
+    "packed opaque colours": ("a.csv", "x,y,z,hex\n" + table(",", ",#28AA3Cff", columns=POINTS)),
     "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
     "rows of dashes": (
         "a.txt",
@@ -94,6 +94,7 @@ TEXTS = {
         "x,y,z,r,g,b,name\n9,nan,9,1,2,3,A1\n" + table(",", ",12"),
     ),
     "names behind a word": ("a.txt", "# columns: b g r z y x\n" + table(" ", columns=BACKWARDS)),
+    "a title like names": ("a.txt", "xyz\n" + table(" ")),
     "names in one word": ("a.txt", "# bgrzyx\n" + table(" ", columns=BACKWARDS)),
     "names in brackets": ("a.txt", "# ['b', 'g', 'r', 'z', 'y', 'x']\n" + table(" ", columns=BACKWARDS)),
     "names behind a semicolon": ("a.txt", "; b g r z y x\n" + table(" ", columns=BACKWARDS)),
@@ -180,7 +181,7 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
     tables = {"arr_0": BALL, "arr_1": opaque[:, :3], "arr_2": BALL} | ignored
     turned = {"vertices": BALL.T, "vertex_colors": opaque[:, :3].T}
     maps = {"pts3d": BALL.reshape(20, 21, 3), "point_rgb": opaque.reshape(20, 21, 4)}
-    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque, "p": BALL[:, 0], "data": 3 * BALL}
+    separate = dict(zip("xyz", BALL.T, strict=True)) | {"rgb": opaque, "v": BALL[:9]}
     igl = {"v": BALL, "f": np.zeros((9, 3)), "rgba": opaque}
     for arrays in ({"arr_0": ROWS}, tables, separate, {"pc": np.array(ROWS)}, turned, maps, igl):
         np.savez(tmp_path / "c.npz", **arrays)

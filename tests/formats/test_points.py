@@ -131,6 +131,7 @@ REFUSED = [
     ("a.ply", ply_bytes(LITTLE, rows=[]), "holds 0 points"),
     ("a.xyz", "nan 0 0\n1 nan 0\n", "no point that can be used: NaN, infinity .* in all of its 2 rows"),
     ("a.csv", "u,v,w\n0,0,0\n", r"needs the properties x y z \(and may have .*\); found u v w"),
+    ("a.csv", "x,y,z,rough\n0,0,0,0.5\n1,1,1,12\n", "has roughness from 0.5 to 12; expected 0 to 1"),
     ("a.xyz", "x y z r g b\n0 0 0 0.5 0.5 -0.2\n", "has red green blue from -0.2 to 0.5; expected 0 to 1"),
     ("a.xyz", "0 0 0 0.5 1.3 0.2\n", "colours up to 1.3: neither 0 to 1 nor 0 to 255"),
     ("a.xyz", "0 0 0 3 4 66000\n", "from .* to 1.0"),

@@ -131,7 +131,8 @@ def test_shrinking_by_a_whole_factor_takes_the_mean_of_each_block():
 def test_grey_images_of_sixteen_bits_or_floats_are_scaled_not_clipped():
     stream = png(np.zeros((1, 1, 3)))
     assert decode_image(stream).tolist() == [[[0, 0, 0, 255]]]
-    for levels, kind in ((np.array([[0, 32896, 65535]], np.uint16), "png"), (np.float32([[-1, 128 / 255, 7]]), "tiff")):
+    shares, numbers = np.float32([[-1, 128 / 255, 1]]), np.float32([[np.nan, 128, 300]])
+    for levels in (np.array([[0, 32896, 65535]], np.uint16), shares, numbers):
         stream = io.BytesIO()
-        Image.fromarray(levels).save(stream, kind)
+        Image.fromarray(levels).save(stream, "tiff")
         assert decode_texels(decode_image(stream.getvalue())[..., 1]).tolist() == [[0, np.float32(128 / 255), 1]]

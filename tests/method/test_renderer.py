@@ -109,7 +109,15 @@ class TestViews:
     def test_rays_do_not_know_their_block(self, variables):
         """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-        in_sevens = jax.jit(lambda *given: inference.network(CONFIG).bind(variables).render(*given, block=7))
+
+        @jax.jit
+        def in_sevens(volume, camera):
+            network = inference.network(CONFIG).bind(variables)
+            rays = network.rays(camera)
+            return network.decode_images(
+                camera, paper_method.render_rays(network, volume, rays, CONFIG.sampling, 7, None)
+            )
+
         part = in_sevens(volume, camera())
         close(part, render(variables, volume, camera()), rtol=1e-6, atol=1e-6)
         same_bits(in_sevens(volume, camera()), part)
