@@ -1,7 +1,7 @@
 # Everything a person does here.  Each target makes its own environment in .venv from constraints.txt.
 #   make demo                generate, train, evaluate, report: runs/demo/report.html
 #   make demo MESHES=DIR     the same on a folder of .glb .gltf .obj .ply files: runs/demo-NAME/report.html
-#   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table1.html
+#   make table1              the paper's Table 1, every method trained and scored: runs/table1-tiny/table.md
 #   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--shown 20'    on your data, with more options
 #   make bench               time the network beside a PyTorch twin: runs/bench/table.md (BENCH="--quick")
 #   make test                the everyday suite
