@@ -119,7 +119,7 @@ def study(
     tables = [methods_table(found, labels, METRICS, ("HF energy",), more)]
     if len(variants) > 1:
         tables.append(differences_table(found, labels, METRICS))
-    picture = gallery(labels, scored, ("psnr", "detail"))
+    picture = gallery(labels, scored, {"psnr": "PSNR", "detail": "HF energy"})
     results_folder.write(out, found, tables, notes(found), {"gallery.png": picture})
 
 
@@ -236,12 +236,12 @@ def differences_table(found: Mapping, labels: Mapping[str, str], columns: Sequen
     return Table(title="Paired differences", heads=tuple(map(head, columns)), rows=rows, note=note)
 
 
-def gallery(labels: Mapping[str, str], scored: Scored, below: Sequence[str]) -> bytes:
-    """PNG: a row an object, the reference image and every method's picture, with some of its scores below."""
+def gallery(labels: Mapping[str, str], scored: Scored, below: Mapping[str, str]) -> bytes:
+    """PNG: a row an object, the reference and every method's picture; below it the names of some scores, and these."""
     cells, lines = [], []
     for shown in scored.shown:
         cells.append([shown.reference, *(shown.images[name] for name in labels)])
         scores = [[scored.scores[shown.name][name][metric][shown.view] for metric in below] for name in labels]
-        lines.append(["", *(", ".join(f"{value:.2f}" for value in values) for values in scores)])
+        lines.append([", ".join(below.values()), *(", ".join(f"{value:.2f}" for value in values) for values in scores)])
     rows = [f"{shown.name} view {shown.view}" for shown in scored.shown]
     return images.png(figures.grid(cells, ["Reference", *labels.values()], rows, 128, lines))

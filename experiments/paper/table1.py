@@ -110,7 +110,7 @@ def main(options: Table1) -> None:
         **variants.compare(scored, next((name for name in NETWORKS if name in trained), None)),
         "costs": costs(trained, scored),
     }
-    picture = variants.gallery({name: LABELS[name] for name in compared}, scored, ("psnr",))
+    picture = variants.gallery({name: LABELS[name] for name in compared}, scored, {"psnr": "PSNR"})
     results_folder.write(options.out, found, make_tables(found), notes(found), {"gallery.png": picture})
 
 

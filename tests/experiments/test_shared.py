@@ -1,6 +1,7 @@
 """What every experiment stands on: networks, scores, tables, a folder that goes on."""
 
 import dataclasses
+import io
 import os
 import subprocess
 import sys
@@ -9,9 +10,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from support import tiny_dataset
 
-from experiments.comparison import contenders, results_folder, scores, study_objects
+from experiments.comparison import contenders, results_folder, scores, study_objects, variants
 from experiments.paper import fig3
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
@@ -63,6 +65,15 @@ def test_a_picture_that_was_not_kept_is_drawn(tmp_path):
     for name in (*names, *names):
         scores.picture_of(tmp_path, "a/b", rows["a/b"], dataset, name)
     assert calls == [*names, names[1]]
+
+
+def test_a_gallery_names_the_scores_below_its_pictures():
+    white = np.ones((8, 8, 3))
+    shown = [scores.Shown(name="a", view=0, reference=white, images={"ours": white})]
+    scored = scores.Scored(scores={"a": {"ours": {"psnr": np.array([20.0])}}}, shown=shown, seconds={})
+    with Image.open(io.BytesIO(variants.gallery({"ours": "Ours"}, scored, {"psnr": "PSNR"}))) as picture:
+        below = np.asarray(picture)[-12:]
+    assert all((of < 255).any() for of in (below[:, 110:238], below[:, 242:]))
 
 
 def test_a_cut_object_has_its_first_points_and_views_in_averaged_pictures():
