@@ -41,7 +41,7 @@ def cut(
     camera, images = jax.tree.map(lambda x: x[:views], item.camera), item.images[:views]
     if resolution and resolution != camera.height:
         if camera.height % resolution:
-            raise UserError(f"--resolution {resolution}: not a whole share of the data set's {camera.height} pixels")
+            raise UserError(f"{resolution} pixels along a side are not a whole share of the data set's {camera.height}")
         images = np.stack([average_squares(image, camera.height // resolution) for image in images])
         camera = cameras.resize(camera, resolution, resolution)
     return dataclasses.replace(
