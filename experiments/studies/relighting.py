@@ -23,6 +23,7 @@ from experiments.comparison import figures, results_folder, scores
 from experiments.comparison.contenders import checksums, draw_volume
 from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
+from experiments.comparison.view_scores import mean
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
 from spnr_jax.errors import UserError
@@ -120,12 +121,11 @@ def remove_shadows(scene: SurfelScene) -> SurfelScene:
 
 
 def log_errors(item: ObjectData, pictures: Pictures) -> list[float]:
-    """Root mean square of the logarithm of the ratio of linear light inside, of each view, in nepers."""
+    """Root mean square of the logarithm of the ratio of linear light inside, of each view, in nepers, or NaN."""
     found = []
     for image, rgba in zip(pictures.image, item.images, strict=True):
-        inside = rgba[..., 3] == 255
         ours, theirs = (np.log(np.maximum(srgb_to_linear(x), DARK)) for x in (image, data_sets.on_white(rgba)))
-        found.append(float(np.sqrt(np.mean((ours - theirs)[inside] ** 2))) if inside.any() else 0.0)
+        found.append(mean((ours - theirs)[rgba[..., 3] == 255] ** 2) ** 0.5)
     return found
 
 

@@ -49,13 +49,14 @@ def test_the_nearest_views_look_from_the_same_side():
     assert nearest_views(eyes) == [1, 0, 2]
 
 
-def test_the_log_error_of_a_picture_that_is_right_and_of_one_half_as_bright():
+def test_the_log_error_of_a_picture_that_is_right_of_one_half_as_bright_and_of_nothing():
     item = tiny_dataset.one_object()
-    white = data_sets.on_white(item.images)
+    white, clear = data_sets.on_white(item.images), np.minimum(item.images, 254)
     dim = linear_to_srgb(srgb_to_linear(white) / 2)
-    for image, expected in ((white, 0), (dim, np.log(2))):
-        found = relighting.log_errors(item, Pictures(image=image, acc=image[..., 0]))
-        assert found == pytest.approx([expected] * tiny_dataset.VIEWS, abs=1e-3)
+    for image, images, expected in ((white, item.images, 0), (dim, item.images, np.log(2)), (white, clear, np.nan)):
+        pictures, seen = Pictures(image=image, acc=image[..., 0]), dataclasses.replace(item, images=images)
+        found = relighting.log_errors(seen, pictures)
+        assert found == pytest.approx([expected] * tiny_dataset.VIEWS, abs=1e-3, nan_ok=True)
 
 
 def test_a_light_of_harmonics_is_that_of_its_map():
