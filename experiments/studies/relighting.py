@@ -73,10 +73,13 @@ def main(options: RelightingStudy) -> None:
     model, run = load(options.run), checksums((options.run,))
     found: Found = {}
     columns: dict[str, list[np.ndarray]] = {}
-    for folder in options.data:
-        dataset = data_sets.open_dataset(folder)
+    datasets = [data_sets.open_dataset(folder) for folder in options.data]
+    names, *others = (test_objects(dataset, options.objects, max(options.counts)) for dataset in datasets)
+    if any(other != names for other in others):
+        raise UserError("--data: expected data sets of the same test objects, these hold others")
+    for dataset in datasets:
         check_known_light(model.config, dataset)
-        names, light = test_objects(dataset, options.objects, max(options.counts)), name_of(dataset)
+        light = name_of(dataset)
         asked = {"run": run, "views": options.views, "objects": names, "resolution": options.resolution}
         results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)
         rows = {f"{light}/{count:,} points": partial(measure, options, model, count) for count in options.counts}
@@ -88,7 +91,7 @@ def main(options: RelightingStudy) -> None:
         columns |= {f"{light}: reference": references, f"{light}: ours": [picture(name) for name in names[:GALLERY]]}
     _write(options.out, found)
     cells = list(zip(*columns.values(), strict=True))
-    images.write_whole(options.out / "gallery.png", images.png(figures.grid(cells, list(columns), size=256)))
+    images.write_whole(options.out / "gallery.png", images.png(figures.grid(cells, list(columns), names, 256)))
 
 
 def name_of(dataset: data_sets.Dataset) -> str:

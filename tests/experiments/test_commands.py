@@ -263,6 +263,9 @@ def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(left_out, data, tm
 def test_what_a_command_cannot_do_is_refused_by_name(data, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no light of their own"):
         relighting.name_of(tiny_surfels.dataset())
+    given = {"data": (data.lit, data.painted), "out": tmp_path / "new", "run": data.run(), "counts": (32,)}
+    with pytest.raises(ValueError, match="data sets of the same test objects"):
+        relighting.main(relighting.RelightingStudy(**given))
     given = {"data": data.painted, "out": tmp_path / "new", "budget": Budget(quick=True)}
     with pytest.raises(ValueError, match="spnr-data generate DIR --colour-variants 5"):
         fig2.main(fig2.Fig2(**given))
