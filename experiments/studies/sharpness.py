@@ -107,7 +107,7 @@ def main(options: SharpnessStudy) -> None:
         title=f"Sharpness, {len(names)} objects x {options.views} views",
         heads=HEADS,
         rows=tuple(_row(row, objects, known[row]) for row, objects in found.items()),
-        note="Means over objects with 95 % intervals; a true plate shows a blue share of .077.",
+        note="Means over objects with 95 % intervals; a true plate shows a blue share of 0.077.",
     )
     results_folder.write(
         options.out, {"objects": found, "known": known, "hardware": runtime.describe_hardware()}, [table]
@@ -198,7 +198,7 @@ def plate(count: int) -> PointCloud:
 
 
 def blue_share(image: Float[np.ndarray, "height width 3"], opacity: Float[np.ndarray, "height width"]) -> float:
-    """Share of blue in the colour of the plate's front, in linear light; .077 is true (its rims are not seen)."""
+    """Share of blue in the colour of the plate's front, in linear light; 0.077 is true (its rims are not seen)."""
     inside = binary_erosion(opacity > 0.5, iterations=WELL_INSIDE)
     if not inside.any():
         return float("nan")
