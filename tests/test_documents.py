@@ -108,6 +108,9 @@ def test_the_examples_of_differentiable_rendering_give_gradients_and_pictures_th
     pictures = np.asarray(names["pictures"])
     assert pictures.shape == (2, 3, 64, 64, 3)
     assert pictures.std(axis=(0, 1)).max() > 0.01
+    params, plan = names["model"].params, names["plan"]
+    scene = ENCODE(params, names["cloud"], names["neighbors"])
+    assert names["draw"](params, scene, names["camera"], plan=plan).overflow == 0, "the loss's plan holds its picture"
     for name in ("by_color", "by_positions", "by_camera", "by_light"):
         check_gradient(names[name])
 
