@@ -72,6 +72,7 @@ def importance(
         raise UserError(f"importance: {edges.shape[-1]} edges have one weight less, got {weights.shape[-1]} weights")
     edges, weights = jax.lax.stop_gradient((edges, weights))
     mass = weights + padding
+    mass = jnp.where(jnp.any(mass > 0, axis=-1, keepdims=True), mass, 1.0)  # without padding
     cdf = jnp.cumsum(mass / jnp.sum(mass, axis=-1, keepdims=True), axis=-1)
     at = strata(key, weights.shape[:-1], num_samples)
     upper = jnp.minimum(count_at_most(cdf, at), weights.shape[-1] - 1)

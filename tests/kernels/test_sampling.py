@@ -100,6 +100,11 @@ class TestImportance:
         in_peak = (samples >= bins // 3 * width - 1e-6) & (samples <= (bins // 3 + 1) * width + 1e-6)
         assert in_peak.mean() == pytest.approx(0.5, abs=0.01)
 
+    @pytest.mark.parametrize("padding", [1e-5, 0.0])
+    def test_a_ray_without_weights_is_sampled_evenly(self, padding):
+        edges, weights = jnp.linspace(0.0, 1.0, 9), jnp.zeros(8)
+        close(drawn(None, edges, weights, num_samples=4, padding=padding), (np.arange(4) + 0.5) / 4)
+
     def test_no_gradient_passes_through_where_the_samples_lie(self):
         gradients = jax.grad(lambda e, w: jnp.sum(importance(None, e, w, 5)), (0, 1))(EDGES, WEIGHTS)
         close(gradients, (jnp.zeros_like(EDGES), jnp.zeros_like(WEIGHTS)))
