@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,7 +95,7 @@ def table(rows: Sequence[dict], chosen: Sequence[int]) -> Table:
         mark = " (front)" if i in chosen else ""
         change = () if row is base else (f"({row['psnr'] - base['psnr']:+.2f})",)
         cells = [text(row["name"] + mark), number(row["psnr"], 2, more=change)]
-        made.append((Path(row["run"]).name, (*cells, *(number(row[name], n) for name, n in decimals.items()))))
+        made.append((row["run"], (*cells, *(number(row[name], n) for name, n in decimals.items()))))
     return Table(title=f"Quality and cost at {rows[0]['size']} px", heads=heads, rows=tuple(made))
 
 
@@ -127,9 +128,9 @@ def _scatter(axes: Axes, rows: Sequence[dict], y: str) -> None:
     """A point for each setting."""
     runs = list(dict.fromkeys(row["run"] for row in rows))
     for group, color in GROUPS.items():
-        for marker, run in zip(MARKERS, runs, strict=False):
+        for marker, run in zip(cycle(MARKERS), runs, strict=False):
             if shown := [row for row in rows if (row["group"], row["run"]) == (group, run)]:
-                label = group if len(runs) == 1 else f"{Path(run).name}, {group}"
+                label = group if len(runs) == 1 else f"{run}, {group}"
                 across, up = ([row[name] for row in shown] for name in ("ms_view", y))
                 axes.scatter(across, up, s=26, c=color, marker=marker, zorder=3, label=label)
     axes.grid(alpha=0.25)

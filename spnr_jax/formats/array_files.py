@@ -34,11 +34,8 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
         if magic.startswith(b"PK"):
             arrays = read_arrays(file, (*PLACES.split(), "v", *ARRAYS, *UNNAMED), report)
             tables = {plain_name(name): _as_rows(array, report) for name, array in arrays.items()}
-            if "v" in tables and tables.keys() & {
-                *PLACES.split(),
-                *UNNAMED,
-                *POSITION,
-            }:  # only alone does it hold places
+            others = {*PLACES.split(), *UNNAMED, *POSITION}
+            if "v" in tables and tables.keys() & others:  # beside other places it holds something else
                 report("arrays that are not used: v")
                 del tables["v"]
             yield _archive_columns(tables, report)

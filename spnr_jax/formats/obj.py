@@ -39,7 +39,7 @@ SILENT = {"ka", "ks", "ni", "illum", "tf", "sharpness"}  # Phong parameters with
 SHININESS = re.compile(r"\s*# Blender( MTL)?")  # Blender: Ns = 1000 (1 - roughness)^2, formerly 900
 WORD = r"\s+(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(?!\S)"
 OPTION = re.compile(rf"-(\w+)((?:{WORD})*)\s+")
-BEHIND = re.compile(rf"^(.*?)((?:\s+-[a-z]\w*(?:{WORD})+)+)$")  # a file's name, then its options
+BEHIND = re.compile(rf"^(.*?)((?:\s{{1,9}}-[a-z]\w*(?:{WORD}){{1,4}}){{1,9}})$")  # a file's name, then its options
 
 
 def load_obj(path: Path, loading: Loading) -> list[Part]:
