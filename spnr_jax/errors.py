@@ -129,7 +129,10 @@ def spnr() -> None:
 
 
 def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
-    """Exit code of the work: 130 for a stop; 2, with one line on stderr, for an error that the user can fix."""
+    """Exit code of the work: 130 for a stop; 2, with one line on stderr, for an error that the user can fix.
+
+    With `debug`, the call stack is printed before that line.
+    """
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot print stops no picture
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

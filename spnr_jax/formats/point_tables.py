@@ -44,7 +44,7 @@ THOUSANDS = (
     re.compile(r"(?<=\d)['’\ufffd](?=\d{3})"),
 )
 PLAIN = re.compile(r"[-+.,\d\seE]*")  # a line as nearly all are
-PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})((?<=#.{6})ff)?\s*", re.IGNORECASE)  # colour, opaque
+PACKED = re.compile(r"\s*(?:#|0x)([0-9a-f]{6})(?:(?<=#.{6})ff)?\s*", re.IGNORECASE)  # colour, opaque
 COLORED = re.compile("col|rgb|hex|farbe|couleur|scalar|intensity")  # names of columns that may hold such words
 COUNT = re.compile(r"\d+([\s;,]+\d+)?[\s;,]*")  # number of points, and optionally of columns
 DECIMAL = re.compile(r"(?<!\d)0,|,(?!\d{3}(?!\w))")  # a comma that separates no thousands

@@ -182,7 +182,10 @@ def _measure_thickness(near: np.ndarray) -> np.ndarray:
 
 
 def measure_noise(positions: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
-    """Standard deviation of the points' heights above their surface, and their spacing; 0, 0 for few points."""
+    """Standard deviation of the points' heights above their surface, and their spacing; (0, 0) for too few points.
+
+    Below LEAST_DENSE points, noise cannot be told from curvature.  In the units of the positions.
+    """
     distinct, _ = find_distinct(positions)
     if len(distinct) < LEAST_DENSE:
         return 0.0, 0.0

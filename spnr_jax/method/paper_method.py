@@ -90,9 +90,12 @@ class PaperNetwork(nn.Module):
 
     def render(self, scene: Scene, camera: Camera) -> Rendering:
         """Views of encoded objects, some rays at a time; the camera's size is that of the image."""
-        samples = self.config.sampling
-        block = None if samples.reach else WHOLE_BLOCK
-        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, block, None))
+        return self.draw(scene, camera, None if self.config.sampling.reach else WHOLE_BLOCK)
+
+    def draw(self, scene: Scene, camera: Camera, block: int | None, key: Key | None = None) -> Rendering:
+        """Views of encoded objects, `block` rays at a time (`render_rays`).  A key jitters the samples (training)."""
+        drawn = render_rays(self, scene, self.rays(camera), self.config.sampling, block, key)
+        return self.decode_images(camera, drawn)
 
     def rays(self, camera: Camera) -> Rays:
         """Rays of the volume rendering for all views of an object in one axis, (objects, views * height * width, 3)."""
@@ -131,9 +134,8 @@ class PaperNetwork(nn.Module):
         )
 
     def __call__(self, cloud: PointCloud, camera: Camera, key: Key | None = None, train: bool = False) -> Rendering:
-        """Views of each cloud from its cameras, all rays at once.  A key jitters the samples (training)."""
-        scene, samples = self.encode(cloud, train), self.config.sampling
-        return self.decode_images(camera, render_rays(self, scene, self.rays(camera), samples, None, key))
+        """Views of each cloud from its cameras, all rays at once."""
+        return self.draw(self.encode(cloud, train), camera, None, key)
 
 
 # --- rays -------------------------------------------------------------------------------------------------------------

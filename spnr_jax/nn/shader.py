@@ -288,7 +288,10 @@ def compose_picture(
     light_harmonics: Float[Array, "batch 9 3"],
     doublings: int,
 ) -> tuple[Float[Array, "batch h w 3"], Float[Array, "batch h w"]]:
-    """sRGB colour and opacity: materials lit by the light MAPS, times factors of the network's OUTPUTS."""
+    """sRGB colour and opacity: materials lit by the light MAPS, times factors of the network's OUTPUTS.
+
+    `light_harmonics` are the spherical harmonics of the light in camera axes.
+    """
     for _ in range(doublings):
         maps = double_size(maps)
     by_map, by_output = split_channels(maps, MAPS, keep_axis=True), split_channels(outputs, OUTPUTS, keep_axis=True)

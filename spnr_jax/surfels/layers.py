@@ -67,7 +67,10 @@ class QuadricFit(NamedTuple):
 def gather_neighborhoods(
     neighbors: Int[Array, "k block"], positions: Float[Array, "3 block"], columns: Float[Array, "columns all"]
 ) -> Neighborhood:
-    """The neighborhoods of points at given positions; the first three columns of all points are their positions."""
+    """The neighborhoods of points at given positions; the first three of the columns of all points are their positions.
+
+    Indices of neighbors that do not exist are negative.
+    """
     real = neighbors >= 0
     found = gather(columns, neighbors)
     offset = jnp.where(real[:, None], found[:, :3] - positions[None], 0)

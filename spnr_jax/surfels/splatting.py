@@ -87,7 +87,11 @@ class Entries(NamedTuple):
 
 
 def project_discs(surfels: Surfels, camera: Camera) -> Footprints:
-    """Discs projected to a camera; those behind it or outside the picture cover no pixel."""
+    """Discs projected to a camera; those behind it or outside the picture cover no pixel.
+
+    One-sided discs that are seen from behind are drawn with a facing of 0.02 (`CONSTANTS.back_weight`), which is
+    better than a hole.
+    """
     rotation, eye = camera.cam_to_world[:, :3], camera.cam_to_world[:, 3]
     rotated = (rotate_columns(rotation, x) for x in (surfels.position, eye[None]))
     x, y, z = (there - here for there, here in zip(*rotated, strict=True))

@@ -130,7 +130,10 @@ def restore(
     say: Callable[[str], object] = print,
     sharding: jax.sharding.Sharding | None = None,
 ) -> optimisation.TrainState | None:
-    """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint."""
+    """The newest readable state of a run, None if it has none; `say` gets a line for each broken checkpoint.
+
+    The state is placed by `sharding`, by default on the first device.
+    """
     folder = run / "checkpoints"
     if not folder.is_dir():
         return None

@@ -15,7 +15,7 @@ from spnr_jax.config import MATERIAL_CHANNELS
 from spnr_jax.kernels import cameras, sampling, voxels
 from spnr_jax.kernels.cameras import intersect_box
 from spnr_jax.kernels.records import Rays, Scene
-from spnr_jax.method import inference, paper_method
+from spnr_jax.method import inference
 from spnr_jax.nn.paper_layers import Encoder
 
 CONFIG = tiny_model.WITHOUT_UPSAMPLER
@@ -109,15 +109,7 @@ class TestViews:
     def test_rays_do_not_know_their_block(self, variables):
         """To a few roundings: a matrix product of another size adds in another order."""
         volume = encode(variables, cloud())
-
-        @jax.jit
-        def in_sevens(volume, camera):
-            network = inference.network(CONFIG).bind(variables)
-            rays = network.rays(camera)
-            return network.decode_images(
-                camera, paper_method.render_rays(network, volume, rays, CONFIG.sampling, 7, None)
-            )
-
+        in_sevens = jax.jit(lambda *given: inference.network(CONFIG).bind(variables).draw(*given, block=7))
         part = in_sevens(volume, camera())
         close(part, render(variables, volume, camera()), rtol=1e-6, atol=1e-6)
         same_bits(in_sevens(volume, camera()), part)
@@ -200,9 +192,7 @@ class TestEmptySpace:
 
         @partial(jax.jit, static_argnames="block")
         def jittered(key, block):
-            network = inference.network(NEAR).bind(variables)
-            drawn = paper_method.render_rays(network, encoded, network.rays(generic), NEAR.sampling, block, key)
-            return network.decode_images(generic, drawn)
+            return inference.network(NEAR).bind(variables).draw(encoded, generic, block, key)
 
         few, many = (jittered(jax.random.key(0), block) for block in (7, 256))
         close(few, many, atol=1e-5)
