@@ -293,7 +293,7 @@ def _names(
     `unread` are columns of words.
     """
     count, known = table.shape[1], np.flatnonzero(~np.isnan(table).all(axis=0))
-    filled = 1 + int(max(2, *known, *unread))
+    filled = 1 + int(max((2, *known, *unread)))
     found: list[tuple[list[str], list[str]]] = []  # names, and lines between them and the numbers
     unfit, below = list[str](), list[str]()
     for line in reversed(before):

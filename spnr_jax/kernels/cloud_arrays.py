@@ -153,7 +153,7 @@ AROUND, SAMPLE = 128, 1024  # neighbours that determine the spacing; points at w
 FEW = 8  # distinct points: with fewer, the spacing is meaningless
 PLACE = 1e-6  # of the extent: closer points share one place
 CROWDED = 64  # nearly equal points around each, above which one stands for all in a voxel
-LINE = 1e-13  # largest variance of a line across it, as a share of that along it
+LINE = 1e-11  # largest variance of a line across it, as a share of that along it
 CANCELLED = 0.5  # length of a mean of unit normals below which they contradict each other
 
 
