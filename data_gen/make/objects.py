@@ -55,6 +55,7 @@ def make_record(bench: Workbench, task: Task) -> layout.ObjectRecord:
     view = views.ViewConfig(**{field.name: getattr(config, field.name) for field in fields(views.ViewConfig)})
     asset, details = make_asset(task, config.seed)
     surface = surface_points.sample_surface(asset, config.points, seeds["points"], config.spread)
+    surface = surface._replace(positions=surface.positions.astype(np.float32))  # as the file holds them
     cam_to_world = views.random_viewpoints(view.views, view.distance, np.random.default_rng(seeds["viewpoints"]))
     maps = list(bench.lights.of_views(view.views, seeds["noise"]))
     images, conditions = views.render_views(asset, surface, cam_to_world, maps, view, seeds["noise"])

@@ -23,7 +23,7 @@ from spnr_jax.formats.polygons import PLAIN
 from spnr_jax.formats.surface_points import bounding_box, face_areas
 from spnr_jax.kernels.triangles import face_crosses, unit, vertex_normals
 
-# Faces below this share of the squared box diagonal are float32 rounding, not surface.
+# Faces below this share of their longest edge squared (for references, of the box's diagonal) are rounding, no surface.
 DEGENERATE_AREA = 1e-14
 ACROSS = 0.5  # median cosine between normals and faces, below which the normals are ignored
 MAX_TEXCOORD = 1e6  # beyond it the renderer's float32 cannot resolve neighbouring texels
@@ -71,10 +71,12 @@ def assemble(parts: list[Part], loading: Loading) -> list[Part]:
         raise UserError(f"has nothing to draw: {'; '.join(notes)}" if (notes := loading.notes()) else "has no faces")
     parts = parts if loading.strict else _without_false_normals(_visible(parts, loading), loading)
     low, high = bounding_box(Asset(parts=tuple(parts)))
-    smallest, degenerate = DEGENERATE_AREA * np.sum((high - low) ** 2), 0
+    degenerate = 0
     groups: dict[tuple, list[Part]] = {}
     for whole in parts:
-        solid = face_areas(whole) > smallest
+        edges = np.diff(whole.positions[whole.faces[:, [0, 1, 2, 0]]], axis=1)
+        largest = np.sum((high - low) ** 2) if loading.strict else np.sum(edges**2, axis=-1).max(axis=-1)
+        solid = face_areas(whole) > DEGENERATE_AREA * largest
         degenerate += int((~solid).sum())
         if solid.any():
             part = _clean_part(replace(whole, faces=whole.faces[solid]), loading)

@@ -20,7 +20,7 @@ CANDIDATES = 4  # points drawn for each kept point of an even spread
 
 
 class SurfacePoints(NamedTuple):
-    """Surface points, float32: positions, unit normals, linear base colours (n, 3), materials, global face (n,)."""
+    """Surface points: positions float64, unit normals, linear base colours (n, 3), materials float32, face (n,)."""
 
     positions: np.ndarray
     normals: np.ndarray
@@ -68,7 +68,8 @@ def sample_surface(
     if spread == "random":
         return _random_points(asset, num_points, seed)
     drawn = _random_points(asset, CANDIDATES * num_points, seed)
-    chosen = farthest_points(drawn.positions, num_points, seed, drawn.normals if sides else None)
+    places = drawn.positions.astype(np.float32)  # for distances, not for what is kept
+    chosen = farthest_points(places, num_points, seed, drawn.normals if sides else None)
     return SurfacePoints(*(column[chosen] for column in drawn))
 
 
@@ -88,8 +89,8 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
         face = np.minimum(face, np.searchsorted(cumulative, cumulative[-1]))  # the product may round up to the total
         root, along = rng.random((num_points, 2)).T ** [[0.5], [1]]
         barycentric = np.stack([1 - root, root * (1 - along), root * along], axis=-1)  # uniform over the triangle
-        vectors, values = np.zeros((3, num_points, 3), np.float32), np.zeros((2, num_points), np.float32)
-        points = SurfacePoints._make([*vectors, *values, face.astype(np.int32)])
+        vectors, values = np.zeros((2, num_points, 3), np.float32), np.zeros((2, num_points), np.float32)
+        points = SurfacePoints(np.zeros((num_points, 3)), *vectors, *values, face.astype(np.int32))
         solid = np.ones(num_points, bool)
         for part, first in zip(asset.parts, first_face, strict=False):
             here = (face >= first) & (face < first + len(part.faces))

@@ -16,6 +16,7 @@ from support.mesh_files import CORNERS, OBJ_FACE, RGB, SQUARE, square_ply, stl
 from support.point_clouds import BALL, GREEN, LINEAR, read, write, write_rows
 
 from spnr_jax.config import Cut
+from spnr_jax.formats import clouds
 from spnr_jax.formats.clouds import place_cloud, read_cloud
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.cloud_arrays import merge_repeats
@@ -222,6 +223,16 @@ def test_the_origin_is_that_of_what_is_cut_out_and_cleaned(tmp_path):
         placed = place_cloud(tmp_path / "a.npy", up="y", **options)
         back = placed.cloud.positions + placed.origin
         np.testing.assert_allclose(back, 0.3 * BALL + UTM, rtol=0, atol=1e-6)
+
+
+def test_a_part_that_is_cut_out_of_a_mesh_keeps_its_digits_whatever_lies_far_away(tmp_path, monkeypatch):
+    monkeypatch.setattr(clouds, "CUT_MESH", 2**12)
+    corners, small = np.concatenate([0.2 * SQUARE + UTM, 0.2 * SQUARE]), Cut(crop=(*(UTM - 1), *(UTM + 1)))
+    content = "".join("v {:.4f} {:.4f} {:.4f}\n".format(*corner) for corner in corners)
+    path = write(tmp_path, "a.obj", content + OBJ_FACE + "f 5 6 7 8\n")
+    placed = place_cloud(path, num_points=300, up="y", cut=small)
+    np.testing.assert_allclose(np.ptp(placed.cloud.positions, axis=0), [0.2, 0.2, 0], atol=0.01)
+    assert len(np.unique(placed.cloud.positions[:, 1])) > 290
 
 
 def test_a_stray_point_far_away_takes_no_digit_of_the_others(tmp_path):
