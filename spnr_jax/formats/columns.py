@@ -66,7 +66,7 @@ OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera")
 NAMES = {name for group in ALIASES.values() for names in group for name in names}
 ARRAYS = {name.removesuffix("0") for name in NAMES}
 UNSAID = ("f_dc_", "f_rest_", "scale_", "rot_", "_")  # beginnings of the names of splats' columns, and of padding
-SHOWN_NAMES, LONGEST_NAME = 6, 40  # in a sentence
+SHOWN_NAMES, LONGEST_NAME = 12, 40  # in a sentence
 DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
@@ -84,7 +84,7 @@ NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 def name_columns(fields: dict[str, np.ndarray]) -> Columns:
     """Columns (points,) of numeric fields (points,) or (points, c), c < 5; named name:0, name:1 ... as in ParaView.
 
-    Wider fields are dropped.
+    Of wider fields, and of words, only the name is kept, with a word of what they hold.
     """
     columns: Columns = {}
     for name, values in fields.items():
@@ -95,6 +95,9 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
         if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
             several = {f"{own}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
             columns |= several or {own: values.reshape(-1)}
+        else:
+            what = f"{values[:1].size} numbers" if values.dtype.kind in "fiub" else "words"
+            columns[f"{own} ({what})"] = np.zeros(len(values), bool)
     return columns
 
 
@@ -159,8 +162,9 @@ def describe_use(columns: Columns) -> list[str]:
 
 
 def list_names(names: list[str]) -> str:
-    """The first names, shortened, for a message."""
-    return ", ".join(name[:LONGEST_NAME] for name in names[:SHOWN_NAMES])
+    """The first names, shortened, and the number of the others, for a message."""
+    more = f" and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
+    return ", ".join(name[:LONGEST_NAME] for name in names[:SHOWN_NAMES]) + more
 
 
 def sound(columns: Columns) -> np.ndarray:

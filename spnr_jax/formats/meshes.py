@@ -101,7 +101,7 @@ def _check_columns(part: Part) -> None:
 
 def _visible(parts: list[Part], loading: Loading) -> list[Part]:
     """The parts without faces that have a non-finite vertex or only invisible ones; notes give their number."""
-    lost = {"for a vertex that is NaN or infinity": 0, "for the alpha of their vertices, near 0": 0}
+    lost = {"for a vertex that is NaN or infinity": 0, "for their alpha, near 0": 0}
     for number, part in enumerate(parts):
         hidden = invisible({"x": part.positions[:, 0]} | ({} if part.alpha is None else {"alpha": part.alpha}))
         broken = ~np.isfinite(part.positions[part.faces]).all(axis=(1, 2))

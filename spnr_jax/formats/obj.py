@@ -68,7 +68,7 @@ def load_obj(path: Path, loading: Loading) -> list[Part]:
         elif colors is not None and look is not None and look.base_color.ndim == 1:
             loading.say("colours of the vertices multiply those of the material", about=repr(name))
         looks[name] = look, move
-    parts = _parts(text, stack_columns(columns), colors, looks, loading)
+    parts = _parts(text, columns, colors, looks, loading)
     if loose := len(text["v"]) - len({word.split("/")[0] for word in text["f"]}):
         loading.ignored.add(f"{loose:,} vertices of no face")
     if text["vn"] and any(part.normals is None for part in parts):
@@ -121,9 +121,12 @@ def _columns(text: Rests, loading: Loading) -> Columns:
     if bare.any():
         loading.say(f"{bare.sum():,} of {len(rows):,} vertices have no colour: white taken")
         table[bare, 3:] = full_scale(table.dtype, float(table[~bare, 3:].max()))
-    if table.shape[1] == 7 and (table[:, 3] == 1).all() and not (table[:, 6] == 1).all():  # weights of the vertices
+    ones = (table[:, 3:] == 1).all(axis=0).tolist()
+    if len(ones) == 4 and ones[0] and not (ones[3] or all(ones[:3])):  # weights of the vertices, not white and alpha
         table = np.delete(table, 3, axis=1)
-    columns = dict(zip((*"xyz", *SRGB), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    if table.shape[1] in (4, 5) and (table[:, 3:] != 1).any():
+        loading.ignored.add("numbers behind the coordinates of vertices")
+    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
     digits = "".join(text[POLYPAINT])[: 8 * len(table)]
     if len(digits) == 8 * len(table) and re.fullmatch("[0-9a-fA-F]*", digits):
         columns |= dict(zip(SRGB, np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 4).T[1:], strict=True))
@@ -133,7 +136,7 @@ def _columns(text: Rests, loading: Loading) -> Columns:
 
 
 def _parts(
-    text: Rests, positions: np.ndarray, colors: np.ndarray | None, looks: dict[str, Look], loading: Loading
+    text: Rests, columns: Columns, colors: np.ndarray | None, looks: dict[str, Look], loading: Loading
 ) -> list[Part]:
     """The faces of each visible material, split by whether they have texture coordinates and normals."""
     numbers = {word: i for i, word in enumerate(dict.fromkeys(text["f"]))}
@@ -144,7 +147,8 @@ def _parts(
         if last > (count := len(text[keyword])):
             raise UserError(f"has faces that name {keyword} {last} of {count}: broken file")
     of_v, of_vt, of_vn = corners.T - 1
-    positions, colors = positions[of_v], None if colors is None else colors[of_v]
+    positions, colors = stack_columns(columns)[of_v], None if colors is None else colors[of_v]
+    alpha = columns["alpha"][of_v] if "alpha" in columns else None
     texcoords = _table([f"{row} 0" for row in (*text["vt"], "0")], 2, "vt")[of_vt]  # a 1-D coordinate gets v = 0
     normals = _table([*text["vn"], "0 0 0"], 3, "vn")[of_vn]
     faces, owner = triangulate(positions, np.array([numbers[word] for word in text["f"]]), text["f sizes"])
@@ -173,7 +177,7 @@ def _parts(
             else:
                 loading.say("colours of the vertices not used beside those of a texture")  # often the same (Metashape)
                 own = None
-        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=own)
+        part = Part(positions=positions, faces=faces[kind == code], material=material, colors=own, alpha=alpha)
         parts.append(replace(part, normals=normals if code & 1 else None, texcoords=placed))
     return parts
 

@@ -17,12 +17,24 @@ import numpy as np
 
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import RGB, Loading, Part, Texels, make_material
-from spnr_jax.formats.columns import NORMAL, SRGB, Columns, base_color, colors_of, describe_use, rename, useful
+from spnr_jax.formats.columns import (
+    NORMAL,
+    SRGB,
+    Columns,
+    base_color,
+    colors_of,
+    describe_use,
+    invisible,
+    list_names,
+    rename,
+    useful,
+)
 from spnr_jax.formats.point_tables import load_text, open_text
 from spnr_jax.formats.row_files import USED, Lists, read_elements, read_header
 from spnr_jax.kernels.cloud_arrays import stack_columns
 from spnr_jax.kernels.triangles import strip_faces, triangulate
 
+UNREAD = ("roughness", "metallic", "classification", "withheld")  # of the vertices of meshes
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 STL_HEAD, STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 OFF_HEAD = re.compile(r"(?:((?:ST|C|N)*)OFF(?=\d|\b)\s*)?(?=\d+[^\S\n]+\d+)")
@@ -54,9 +66,12 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     number = np.asarray(of_faces.get("texnumber", np.zeros(len(sizes))), np.int64)
     if len(number) and (number.min(), number.max()) == (1, len(images)):  # counted from 1
         number = number - 1
+    columns = _describe_vertices(vertices, loading)
+    if colors_of(columns):
+        loading.say("colours of the vertices not used beside those of a texture")
     wanted = [(image, number == i) for i, image in enumerate(images) if image is not None]
     parts = [
-        _textured(useful(vertices), corners[np.repeat(own, sizes)], sizes[own], texcoords[np.repeat(own, sizes)], image)
+        _textured(columns, corners[np.repeat(own, sizes)], sizes[own], texcoords[np.repeat(own, sizes)], image)
         for image, own in wanted
     ]
     if (rest := ~np.any([own for _, own in wanted], axis=0)).any():
@@ -128,8 +143,10 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
     num_vertices, num_faces = (int(word) for word in counts.split()[:2])
     if len(rows) < num_vertices + num_faces:
         raise UserError(f"is cut off: {num_vertices} vertices and {num_faces} faces announced, {len(rows)} lines found")
-    kind, color = head[1] or "", [*SRGB, "alpha"]
-    names = [*"xyz", *(NORMAL if "N" in kind else ()), *color] if "NC" not in kind else [*"xyz", *color, *NORMAL]
+    kind, color = head[1] or "", (*SRGB, "alpha")
+    behind_normals = TEXCOORDS[0] if "ST" in kind and "C" not in kind else color
+    names = [*"xyz", *(NORMAL if "N" in kind else ()), *behind_normals]
+    names = [*"xyz", *color, *NORMAL] if "NC" in kind else names
     vertices = [*enumerate(rows[:num_vertices])]
     table = load_text(vertices, "vertex", len(rows[0].split()), ndmin=2) if vertices else np.zeros((0, 3))
     columns = dict(zip(names, table.T, strict=False))
@@ -140,7 +157,8 @@ def load_off(path: Path, loading: Loading) -> list[Part]:
         raise UserError("is cut off: a face names fewer corners than it announces")
     behind = [face[1 + size :] for face, size in zip(faces, sizes, strict=True)]
     colored = bool(behind) and all(len(values) in (3, 4) for values in behind)
-    of_faces = dict(zip(SRGB, np.array([values[:3] for values in behind]).T, strict=True)) if colored else {}
+    width = min(map(len, behind), default=0)
+    of_faces = dict(zip(color, np.array([x[:width] for x in behind]).T, strict=False)) if colored else {}
     if any(behind) and not colored and SRGB[0] not in columns:
         loading.ignored.add("colours of some faces alone, or by a palette")
     numbers = np.array([number for own in corners for number in own])
@@ -158,17 +176,17 @@ def colored_part(
 
     Vertices of one colour beside polygons of several do not count.
     """
-    columns = useful(vertices)
-    loading.say(*describe_use({name: x for name, x in vertices.items() if name not in sum(TEXCOORDS, ())}))
+    columns = _describe_vertices(vertices, loading)
     positions = stack_columns(columns)
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
-    if {"roughness", "metallic"} & columns.keys():
-        loading.ignored.add("roughness and metallic of vertices")
-    alpha, (colors, notes) = columns.get("alpha"), colors_of(columns) or (None, [])
+    alpha, (colors, notes) = np.where(invisible(columns), 0.0, 1.0), colors_of(columns) or (None, [])
+    used = dict[str, np.ndarray]()
     if (found := _face_colors(of_faces, colors)) is not None:
         loading.ignored |= set() if colors is None else {"the one colour of all vertices, beside those of faces"}
-        normals, alpha = (None if x is None else x[faces.ravel()] for x in (normals, alpha))
+        used = rename(of_faces)
+        normals = None if normals is None else normals[faces.ravel()]
+        alpha = alpha[faces.ravel()] * np.repeat(~invisible(used | {"x": sizes})[owner], 3)
         positions = positions[faces.ravel()]
         colors, notes = np.repeat(found[0][owner], 3, axis=0), found[1]
         faces = np.arange(faces.size).reshape(-1, 3)
@@ -176,7 +194,18 @@ def colored_part(
         colors = base_color(columns, loading.say)  # of intensities
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
+    taken = {"texnumber", *(name for name, x in of_faces.items() if any(x is own for own in used.values()))}
+    if left := [name for name in of_faces if name not in taken]:
+        loading.say(f"columns of faces that are not used: {list_names(left)}")
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]
+
+
+def _describe_vertices(vertices: Columns, loading: Loading) -> Columns:
+    """The columns of vertices under our names; notes say what of them is not used."""
+    columns = useful(vertices)
+    loading.say(*describe_use({name: x for name, x in vertices.items() if name not in sum(TEXCOORDS, ())}))
+    loading.ignored |= {f"{name} of vertices" for name in UNREAD if name in columns}
+    return columns
 
 
 def _face_colors(of_faces: Columns, colors: np.ndarray | None) -> tuple[np.ndarray, list[str]] | None:

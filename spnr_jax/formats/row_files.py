@@ -187,6 +187,7 @@ def row_pieces(path: Path, report: Report, kind: str) -> Iterator[Columns]:
             fields = {name: found for name, found in lists.items() if plain_name(name) in ARRAYS}
             if any(np.ptp(sizes) for sizes, _ in fields.values() if len(sizes)):
                 raise UserError(f"has lists of several lengths: {list_names([*fields])}")
+            columns |= {f"{name} (lists)": sizes for name, (sizes, _) in lists.items() if name not in fields}
             yield columns | name_columns({name: x.reshape(len(sizes), -1) for name, (sizes, x) in fields.items()})
         (name, count, properties), begin = header.elements[-1], file.tell()
         if name != "vertex" or any(isinstance(width, str) for *_, width in properties):

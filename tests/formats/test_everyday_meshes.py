@@ -49,11 +49,66 @@ def test_faces_with_a_vertex_that_is_no_number_are_left_out_and_counted(tmp_path
         cloud, lines = read(write(tmp_path, name, text), num_points=100)
         assert np.isfinite(cloud.positions).all()
         assert "1 face left out for a vertex that is NaN or infinity" in lines
-    hidden = "COFF\n4 2 0\n" + "".join(f"{c} 1 1 1 {i // 3}\n" for i, c in enumerate(CORNERS)) + "3 0 1 2\n3 0 2 3\n"
-    cloud, lines = read(write(tmp_path, "a.off", hidden), num_points=100)
+
+
+def by_corner(text: str, *values) -> str:
+    """The text with the four marks `?` replaced by these values."""
+    return "".join(map("".join, zip(text.split("?"), [*map(str, values), ""], strict=True)))
+
+
+TWO, TWO_OF_OBJ = "3 0 1 2\n3 0 2 3\n", "f 1 2 3\nf 1 3 4\n"
+FACES_RGBA = "".join(f"property uchar {name}\n" for name in (*RGB, "alpha")) + "end_header"
+PAINTED = square_ply("uchar", RGB, GREEN).replace("3 0 1 2", "3 0 1 2 9 9 9 0").replace("3 0 2 3", "3 0 2 3 9 8 9 255")
+HIDDEN = {  # a square of which the first triangle is transparent
+    "COFF": ("a.off", "COFF\n4 2 0\n" + by_corner("".join(f"{c} 1 1 1 ?\n" for c in CORNERS), 0, 0, 0, 1) + TWO),
+    "OBJ": ("a.obj", by_corner("".join(f"v {c} 1 1 1 ?\n" for c in CORNERS), 0, 0, 0, 1) + TWO_OF_OBJ),
+    "opacity": ("a.ply", by_corner(square_ply("float", ["opacity"], "?"), 0, 0, 0, 1)),
+    "rgba": ("a.ply", by_corner(square_ply("uint", ["rgba"], "?"), 1, 1, 1, 2**32 - 1)),
+    "faces of OFF": ("a.off", "OFF\n4 2 0\n" + "\n".join(CORNERS) + "\n3 0 1 2 9 9 9 0\n3 0 2 3 9 9 9 255\n"),
+    "faces of PLY": ("a.ply", PAINTED.replace("end_header", FACES_RGBA)),
+}
+
+
+@pytest.mark.parametrize("case", HIDDEN)
+def test_faces_that_are_transparent_are_left_out_and_counted(tmp_path, case):
+    cloud, lines = read(write(tmp_path, *HIDDEN[case]), num_points=100)
     assert (cloud.positions[:, 1] >= cloud.positions[:, 0]).all()
-    assert "1 face left out for the alpha of their vertices, near 0" in lines
-    assert not any("alpha" in line for line in read(write(tmp_path, "a.off", hidden.replace(" 1\n", " 0\n")))[1])
+    assert "1 face left out for their alpha, near 0" in lines
+    if case == "COFF":
+        invisible = HIDDEN[case][1].replace(" 1\n", " 0\n")
+        assert not any("alpha" in line for line in read(write(tmp_path, "a.off", invisible))[1])
+
+
+SEVERAL = by_corner("".join(f"v {c} ?\n" for c in CORNERS), 1, 1, 2, 1) + TWO_OF_OBJ
+BOTH = by_corner(square_ply("uchar", ["r", "g", "b"], ("?", 0, 0)), 1, 2, 3, 4)
+FLAGS = "property int flags\nproperty float quality\nend_header"
+UNUSED = {
+    "columns of faces that are not used: red, green, blue, alpha": (
+        "a.ply",
+        BOTH.replace("end_header", FACES_RGBA)
+        .replace("3 0 1 2", "3 0 1 2 1 1 1 0")
+        .replace("3 0 2 3", "3 0 2 3 9 9 9 9"),
+    ),
+    "columns of faces that are not used: flags, quality": (
+        "a.ply",
+        BOTH.replace("end_header", FLAGS).replace("3 0 1 2", "3 0 1 2 0 0").replace("3 0 2 3", "3 0 2 3 0 0"),
+    ),
+    "ignored: classification of vertices; withheld of vertices": (
+        "a.ply",
+        square_ply("uchar", ["classification", "withheld"], (7, 1)),
+    ),
+    "ignored: numbers behind the coordinates of vertices": ("a.obj", SEVERAL),
+}
+
+
+@pytest.mark.parametrize("line", UNUSED)
+def test_what_a_mesh_holds_and_is_not_used_is_said(tmp_path, line):
+    assert line in read(write(tmp_path, *UNUSED[line]), num_points=9)[1]
+
+
+def test_texture_coordinates_of_an_off_are_no_colours(tmp_path):
+    content = "STOFF\n4 2 0\n" + "".join(f"{c} 0 1\n" for c in CORNERS) + TWO
+    assert not any("not used" in line for line in read(write(tmp_path, "a.off", content), num_points=9)[1])
 
 
 def textured_obj(folder: Path, image: str, mtl: bytes) -> Path:

@@ -188,6 +188,9 @@ def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
         np.testing.assert_allclose(read_cloud(tmp_path / "c.npz").base_color[0], LINEAR, atol=1e-3)
 
 
+NUMBERED, NUMBERS = ["x", "y", "z", *(f"c{i}" for i in range(20))], np.column_stack([BALL, np.zeros((420, 20))])
+ODD = np.zeros(420, [*((axis, "f8") for axis in "xyz"), ("name", "U8"), ("fpfh", "f4", 33)])
+ODD["x"], ODD["y"], ODD["z"] = BALL.T
 HALF = [(*row, 255 * (i % 2)) for i, row in enumerate(ROWS)]
 MOVING = np.column_stack([BALL, np.roll(BALL, 1, axis=0) * np.arange(1, 4)])
 
@@ -211,6 +214,8 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             table(" ", columns=LABELED),
             "the 7 columns, which have no names, taken as x y z r g b scalar; r g b may",
         ),
+        ("a.npy", as_npy(ODD), "columns that are not used: name (words), fpfh (33 numbers)"),
+        ("a.csv", ",".join(NUMBERED) + "\n" + table(",", columns=NUMBERS), "columns that are not used: c0, c1, c2, c3"),
         ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
         (
             "a.csv",
@@ -258,7 +263,9 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
     ],
 )
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
-    assert any(found.startswith(line) for found in read(write(tmp_path, name, data))[1])
+    lines = read(write(tmp_path, name, data))[1]
+    assert any(found.startswith(line) for found in lines)
+    assert any(found.endswith("c11 and 8 more") for found in lines) == ("c0" in line)
 
 
 SHADE = 0.5 + 0.4 * np.sin(3 * BALL[:, :1]) * np.cos(4 * BALL[:, 1:2])  # of a surface, as a camera sees it
