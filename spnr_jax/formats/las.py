@@ -32,7 +32,7 @@ COMPRESSED = 0xC0  # flag bits of the point format
 
 
 def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
-    """The columns x y z, COLUMNS and extra bytes of a scan, some points at a time."""
+    """The columns x y z, COLUMNS, extra bytes, and what else differs among the first points, some at a time."""
     laspy, _ = extra("laspy", "formats"), extra("lazrs", "formats")
     backends = (laspy.LazBackend.Lazrs,)  # its parallel reader aborts the process on a damaged file
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -46,10 +46,13 @@ def las_pieces(path: Path, report: Report) -> Iterator[Columns]:
             refusing("is a broken or truncated LAS file"),
             laspy.open(path, laz_backend=backends, read_evlrs=False) as scan,
         ):
-            own = scan.header.point_format
-            names = [*({*COLUMNS} & {*own.dimension_names}), *own.extra_dimension_names]
+            own, names = scan.header.point_format, list[str]()
             for points in scan.chunk_iterator(max(1, PIECE_BYTES // scan.header.point_format.size)):
                 columns = {axis: np.asarray(getattr(points, axis), np.float64) for axis in "xyz"}
+                if not names:  # the format's own fields are there even if nothing is known of them
+                    needed = {*COLUMNS, *own.extra_dimension_names}
+                    others = {name for name in {*own.dimension_names} - {*"XYZ"} - needed if np.ptp(points[name])}
+                    names = [name for name in own.dimension_names if name in needed | others]
                 yield columns | name_columns({name: np.asarray(points[name]) for name in names})
     except UserError as error:
         if not isinstance(error.__cause__, UnicodeDecodeError):

@@ -77,6 +77,19 @@ def test_what_announces_more_than_the_file_holds_never_reaches_the_library(suffi
         read_cloud(tmp_path / f"a{suffix}")
 
 
+def test_fields_that_differ_among_the_points_and_are_not_used_are_named(tmp_path):
+    import laspy
+
+    as_scan(tmp_path / "a.las", WHOLE)
+    scan = laspy.read(tmp_path / "a.las")
+    scan.scan_angle, scan.user_data[:] = np.arange(12), 7
+    scan.write(tmp_path / "a.las")
+    assert "columns that are not used: scan_angle" in read(tmp_path / "a.las")[1]
+    laspy.create(point_format=3).write(tmp_path / "a.las")
+    with pytest.raises(ValueError, match="holds 0 points"):
+        read(tmp_path / "a.las")
+
+
 def test_extra_bytes_whose_names_are_not_in_utf_8_are_named(tmp_path):
     import laspy
 
