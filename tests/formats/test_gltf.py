@@ -134,13 +134,15 @@ def test_parts_with_equal_materials_merge_and_others_stay_apart(tmp_path):
     assert {z for _, _, z in corners_in_space(second)} == {1}
 
 
-def test_a_part_without_a_material_is_a_rough_metal_for_references_and_none_for_pictures(tmp_path):
+@pytest.mark.parametrize("unlit", [False, True])
+def test_a_part_without_a_material_is_a_rough_metal_for_references_and_none_for_pictures(tmp_path, unlit):
     builder = GltfBuilder()
-    builder.mesh(builder.primitive())
+    material = builder.material(extensions={"KHR_materials_unlit": {}}) if unlit else None
+    builder.mesh(builder.primitive(material=material))
     path = builder.write(tmp_path / "plain.glb")
     for asset, expected in ((load_mesh(path), (1, 1)), (load_mesh(path, transparent_parts="opaque"), (0.5, 0))):
         assert (asset.parts[0].material.roughness, asset.parts[0].material.metallic) == expected
-        assert any("parts without a material" in note for note in asset.notes) == (expected == (0.5, 0))
+        assert any("parts without a material" in note for note in asset.notes) == (expected == (0.5, 0) and not unlit)
 
 
 @pytest.mark.parametrize(("mode", "order"), [(4, SQUARE), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
