@@ -58,10 +58,10 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
 
 
 def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
-    """A table (points, c) of a table (points, c) or (c, points) or a point map (h, w, c)."""
-    if array.ndim == 3 and min(array.shape[:2]) > 1:
+    """A table (points, c) of a table (points, c) or (c, points), or of point maps (..., h, w, c)."""
+    if array.ndim > 2 and min(array.shape[-3:-1]) > 1:
         report(f"an array of {' x '.join(map(str, array.shape))} taken as one cloud; of a batch, save array[0] alone")
-    table = array.reshape(-1, array.shape[2]) if array.ndim == 3 else array
+    table = array.reshape(-1, array.shape[-1]) if array.ndim > 2 else array
     if table.ndim < 2 or not 3 <= len(table) <= MOST_COLUMNS < table.shape[1]:
         return table
     report(f"an array of {len(table)} x {table.shape[1]} taken as one column for each point")

@@ -36,13 +36,14 @@ SILENT = re.compile(
     r"^(scalar_)?grid[\s_]+(?=east|north)|^scalar_|[\s.:_-]+|[äöüß\ufffd]|(?<=colo)u(?=r)"
     r"|^(vert(ex|ices)|points?|cloud)_?(?=colou?r|normal|rgb|xyz)"
 )
-ENDINGS = ("x y z", "0 1 2", "r g b", "red green blue")
-PLACES = "positions points xyz vertices verts pc pcd pos coord coords coordinates position point pts pts3d points3d"
-PLACES += " pointcloud cloud xyzrgb data location pointsmxyz worldpoints p"
-PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "este norte")
+ENDINGS = ("x y z", "0 1 2", "1 2 3", "r g b", "red green blue")
+PLACES = "positions points xyz vertices vertex verts pc pcd pos coord coords coordinates position point pts pts3d"
+PLACES += " points3d pointcloud cloud xyzrgb data location pointsmxyz worldpoints p"
+PLANES = ("easting northing", "east north", "e n", "x y", "rechtswert hochwert", "ost nord", "este norte")
 HEIGHTS = ("z", "height", "elevation", "altitude", "h", "elev", "up", "hhe", "hoehe", "cota")  # hhe: Höhe
 COORDINATES = ["xcoord ycoord zcoord", "xcoordinate ycoordinate zcoordinate"]
-COLORS = "r g b|rf gf bf|fr fg fb|r8 g8 b8|colr colg colb|rot grn blau|rot gruen blau|rouge vert bleu|rojo verde azul"
+COLORS = "r g b|rf gf bf|fr fg fb|r8 g8 b8|r16 g16 b16|colr colg colb|vertexr vertexg vertexb"
+COLORS += "|vertexred vertexgreen vertexblue|rot grn blau|rot gruen blau|rouge vert bleu|rojo verde azul"
 ALIASES = {  # our names -> groups of names in files, without separators; the first complete group is taken
     ours: [[name.replace("_", "") for name in ours]]
     + [[stem + end for end in own.split()] for stem in stems.split() for own in ENDINGS]
@@ -50,19 +51,19 @@ ALIASES = {  # our names -> groups of names in files, without separators; the fi
     for ours, stems, others in (
         (POSITION, PLACES, "|".join([f"{plane} {height}" for plane in PLANES for height in HEIGHTS] + COORDINATES)),
         (LINEAR, "basecolor albedo cd", "linearr linearg linearb|linearred lineargreen linearblue"),  # Houdini: Cd
-        (SRGB, "color colors rgb rgbs rgba diffuse vertex", COLORS),
-        (NORMAL, "n normal normals", ""),
+        (SRGB, "color colors rgb rgbs rgba diffuse", COLORS),
+        (NORMAL, "n norm normal normals", ""),
         (("roughness",), "", "rough|roughnessfactor|pbrroughness"),
         (("metallic",), "", "metalness|metallicfactor|metal|pbrmetallic"),
-        (("intensity",), "", "reflectance|reflectivity|amplitude|gray|grey"),
-        (("alpha",), "", "a|diffusealpha|colora|rgb3|rgba3|color3|colors3"),
+        (("intensity",), "", "reflectance|reflectivity|remission|amplitude|luminance|gray|grey"),
+        (("alpha",), "", "a|af|diffusealpha|colora|rgbaa|rgb4|rgba4|color4|colors4|rgb3|rgba3|color3|colors3"),
         (("opacity",), "", "opacities"),
         *(((name,), "", "") for name in ("rgb", "rgba", "classification", "withheld", "splat_opacity")),
     )
 }
 # if no group is complete: columns whose names differ in one word only, and are not about other things
 WORDS = ((POSITION, "x y z"), (SRGB, "r g b"), (SRGB, "red green blue"))
-OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera")
+OTHERS = re.compile("normal|spec|ambient|emissi|scale|rot|view|tangent|camera|(words|numbers|lists)[)]$")
 NAMES = {name for group in ALIASES.values() for names in group for name in names}
 ARRAYS = {name.removesuffix("0") for name in NAMES}
 UNSAID = ("f_dc_", "f_rest_", "scale_", "rot_", "_")  # beginnings of the names of splats' columns, and of padding
@@ -71,6 +72,7 @@ DEFAULTS = {"base_color": 0.5, "roughness": 0.5, "metallic": 0.0}
 SCALES = (255.0, 1023.0, 4095.0, 65535.0)
 ROUNDING = 1e-4  # distance outside [0, 1] that counts as rounding
 STRAYS, LEAST = 1000, 100  # one outlier in STRAYS values is allowed, if there are at least LEAST
+LARGEST_FLOAT = 100  # of linear colours, roughness or metallic: above it whole numbers are bytes, or of 16 bits
 PERCENT = 10  # of roughness or metallic: the largest value from which all are percent
 DARK, MOSTLY = 0.03, 0.98  # sRGB that looks black; share of black colours that is reported
 BRIGHTEST = 0.99  # quantile of the intensities shown as white; its complement is shown as black
@@ -127,7 +129,8 @@ def rename(columns: Columns) -> Columns:
         if ours[0] not in found:
             found |= dict(zip(ours, map(columns.__getitem__, _differing(columns, words)), strict=False))
     colored = any(set(names) <= found.keys() for names in (LINEAR, SRGB, ("rgb",)))
-    if not colored and found.get("alpha") is plain.get("a"):  # without colours, `a` may mean anything
+    # without colours, `a` may mean anything; of color_1 ... color_3 the last is no alpha
+    if found.get("alpha") is (found.get("blue") if colored else plain.get("a")):
         found.pop("alpha", None)
     if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):
@@ -267,7 +270,7 @@ def _unit_interval(values: np.ndarray, name: str, report: Report) -> np.ndarray:
     """Roughness or metallic in [0, 1], or of percent or whole bytes; ValueError if they lie outside."""
     highest = float(values.max(initial=0))
     percent = values.dtype.kind != "u" and PERCENT < highest <= 100 and not ((values > 0) & (values < 1)).any()
-    whole = 100 < highest <= 255 and not (values % 1).any()
+    whole = LARGEST_FLOAT < highest <= 255 and not (values % 1).any()
     scale = 100.0 if percent else full_scale(values.dtype, highest, linear=not whole)
     if scale > 1:
         report(f"{name} taken to be in 0..{scale:g}")
@@ -290,7 +293,13 @@ def colors_of(columns: Columns) -> tuple[np.ndarray, list[str]] | None:
             channels = np.stack([columns[name] for name in names], axis=-1)
             return linear_colors(channels, " ".join(names), linear=names == LINEAR)
     packed = next((name for name in ("rgb", "rgba") if name in columns), None)
-    return linear_colors(_unpack(columns[packed])[:, :3], packed) if packed else None
+    if packed is None:
+        return None
+    colors, lines = linear_colors(_unpack(columns[packed])[:, :3], packed)
+    # NaN of 32 bits is a colour
+    lost = np.count_nonzero(np.isnan(columns[packed])) if columns[packed].dtype == np.float64 else 0
+    lines += [f"{lost:,} of {len(colors):,} colours are no number or #rrggbb, and taken as black"] if lost else []
+    return colors, lines
 
 
 def _unpack(packed: np.ndarray) -> np.ndarray:
@@ -311,8 +320,9 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
         return np.zeros(channels.shape), []
     strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
     highest = np.partition(channels.max(axis=-1), -1 - strays)[-1 - strays]
+    linear_floats = linear and not (highest > LARGEST_FLOAT and not (channels % 1).any())
     percent = not linear and channels.dtype.kind == "f" and 2 < highest <= 100 and (channels[:LEAST] % 1).any()
-    white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear)
+    white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear_floats)
     low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
     if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
         others = "; sRGB colours are named red green blue" if linear else " or 0 to 255"

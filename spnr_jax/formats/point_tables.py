@@ -96,7 +96,6 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
                     raise broken
                 names = _name_words(names, table, words)
                 _report_cut_numbers(names, table, report)
-            counted["colorless"] += sum(int(np.isnan(table[:, i]).sum()) for i in words if names[i] == "rgb")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         _report_counts(counted, report)
 
@@ -150,15 +149,13 @@ def _report_cut_numbers(names: Sequence[str], table: np.ndarray, report: Report)
 
 
 def _report_counts(counted: Counter[str], report: Report) -> None:
-    """Reports rows and colours that are missing or not read."""
+    """Reports rows that are missing or not read."""
     points, announced = counted["points"], counted["announced"]
     if announced and announced != points:
         end = ": is the file cut off?" if announced > points else ""
         report(f"a line of the file announces {announced:,} points, {points:,} are there{end}")
     if counted["commented"]:
         report(f"{counted['commented']:,} rows that begin with a mark of remarks (# // %) are not read")
-    if counted["colorless"]:
-        report(f"{counted['colorless']:,} of {points:,} colours are no #rrggbb, and taken as black")
 
 
 def _find_delimiter(before: list[str], row: str) -> str | None:

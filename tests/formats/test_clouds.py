@@ -76,7 +76,7 @@ def materials(folder, **columns):
 
 NAMES = {  # of channels, and the linear value of 0.5 in them
     **dict.fromkeys(("red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "rf gf bf"), LEVEL),
-    **dict.fromkeys(("color_red color_green color_blue", "scalar_r scalar_g scalar_b"), LEVEL),
+    **dict.fromkeys(("color_red color_green color_blue", "scalar_r scalar_g scalar_b", "rgb_1 rgb_2 rgb_3"), LEVEL),
     **dict.fromkeys(("colour_r colour_g colour_b", "vertex_color_r vertex_color_g vertex_color_b"), LEVEL),
     **dict.fromkeys(("base_color_r base_color_g base_color_b", "albedo_r albedo_g albedo_b", "Cd.r Cd.g Cd.b"), 0.5),
 }
@@ -125,7 +125,7 @@ def test_intensity_is_grey_where_there_is_no_colour_and_unused_where_there_is(tm
     assert [line.split()[:2] for line in lines] == [["no", name] for name in ("base_color", "roughness", "metallic")]
 
 
-@pytest.mark.parametrize("names", ["nx ny nz", "normal_x normal_y normal_z", "scalar_nx scalar_ny scalar_nz"])
+@pytest.mark.parametrize("names", ["nx ny nz", "norm_x norm_y norm_z", "scalar_nx scalar_ny scalar_nz"])
 def test_normals_have_unit_length_and_turn_with_the_cloud_and_a_row_without_one_gets_zero(tmp_path, names):
     rows = ["0 0 1 0 0 2", "0 1 0 0 -3e-9 0", "1 0 0 0 0 0", "2 0 0 nan 0 1", "3 0 0 inf 0 0", "4 0 0 3 4 0"]
     path = write(tmp_path, "a.csv", "\n".join([f"x y z {names}", *rows]))

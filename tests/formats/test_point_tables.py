@@ -108,6 +108,9 @@ TEXTS = {
     "velocities beside colours": ("a.csv", "x,y,z,r,g,b,linear.x,linear.y,linear.z\n" + table(",", ",-2,0,7")),
     "names with blanks between tabs": ("a.tsv", "Y Coord\tX Coord\tZ Coord\tR\tG\tB\n" + table("\t", columns=NORTHING)),
     "packed colours with a sign": ("a.csv", "x,y,z,rgb\n" + table(",", columns=PACKED)),
+    "names of a mesh": ("a.csv", "vertex_x,vertex_y,vertex_z,r,g,b\n" + table(",")),
+    "tables of Matlab": ("a.csv", "Location_1,Location_2,Location_3,Color_1,Color_2,Color_3\n" + table(",")),
+    "names of a map in German": ("a.csv", "Nord;Ost;Hoehe;R;G;B\n" + table(";", columns=NORTHING)),
     "units in brackets": ("a.csv", "X [m],Y [m],Z [m],R,G,B\n" + table(",")),
     "pandas' index": ("a.csv", ",x,y,z,red,green,blue\n" + table(",", columns=INDEXED)),
     "trailing commas": ("a.csv", "x,y,z,r,g,b\n" + table(",", ",")),
@@ -170,10 +173,11 @@ def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, c
 
 
 def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
-    np.save(tmp_path / "a.npy", BALL.reshape(20, 21, 3))
-    cloud, lines = read(tmp_path / "a.npy")
-    np.testing.assert_allclose(cloud.positions, BALL, atol=1e-6)
-    assert lines[0].startswith("an array of 20 x 21 x 3 taken as one cloud; of a batch")
+    for shape in ((20, 21, 3), (5, 4, 21, 3)):
+        np.save(tmp_path / "a.npy", BALL.reshape(shape))
+        cloud, lines = read(tmp_path / "a.npy")
+        np.testing.assert_allclose(cloud.positions, BALL, atol=1e-6)
+        assert lines[0].startswith(f"an array of {' x '.join(map(str, shape))} taken as one cloud; of a batch")
     np.save(tmp_path / "b.npy", np.column_stack([BALL, np.tile(np.array([*GREEN, 255]) / 255, (420, 1))]))
     np.testing.assert_allclose(read_cloud(tmp_path / "b.npy").base_color[0], LINEAR, atol=1e-3)
     opaque = np.tile(np.uint8([*GREEN, 255]), (420, 1))
@@ -231,7 +235,7 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
         (
             "a.csv",
             "x,y,z,hex\n" + table(",", ",#28aa3c", columns=POINTS) + "1,2,3,none\n",
-            "1 of 421 colours are no #rrggbb",
+            "1 of 421 colours are no number or #rrggbb, and",
         ),
         ("a.csv", MILLIMETRES, "whole numbers among small ones of three decimals in x, y, z: write thousands"),
         (
@@ -243,6 +247,21 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             "a.csv",
             "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF),
             "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
+        ),
+        (
+            "a.csv",
+            "x,y,z,rgb_1,rgb_2,rgb_3,rgb_4\n" + table(",", columns=HALF),
+            "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
+        ),
+        (
+            "a.csv",
+            "x,y,z,albedo_r,albedo_g,albedo_b\n" + table(","),
+            "base_color_r base_color_g base_color_b taken as linear in 0..255",
+        ),
+        (
+            "a.csv",
+            "x,y,z,rgb\n" + table(",", ",99999", columns=POINTS) + "1,2,3,nan\n",
+            "1 of 421 colours are no number or #rrggbb, and taken as black",
         ),
         (
             "a.npz",
