@@ -90,7 +90,7 @@ def _random_points(asset: Asset, num_points: int, seed: int) -> SurfacePoints:
         root, along = rng.random((num_points, 2)).T ** [[0.5], [1]]
         barycentric = np.stack([1 - root, root * (1 - along), root * along], axis=-1)  # uniform over the triangle
         vectors, values = np.zeros((2, num_points, 3), np.float32), np.zeros((2, num_points), np.float32)
-        points = SurfacePoints(np.zeros((num_points, 3)), *vectors, *values, face.astype(np.int32))
+        points = SurfacePoints._make([np.zeros((num_points, 3)), *vectors, *values, face.astype(np.int32)])
         solid = np.ones(num_points, bool)
         for part, first in zip(asset.parts, first_face, strict=False):
             here = (face >= first) & (face < first + len(part.faces))

@@ -145,6 +145,13 @@ REFUSED = [
     ("a.usda", "#usda 1.0\n", r"USD \(text\) of version 1.0, .* Blender"),
     ("a.usdz", b"PK\3\4", r"USD \(package\), which is not read: convert it to .glb"),
     ("a.fbx", b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0", "FBX of version 7400, which is not read: convert it to"),
+    (
+        "a.xml",
+        '<?xml version="1.0"?>\n<VTKFile type="PolyData">',
+        "VTK, which is not read: convert it to .ply, e.g. with Par",
+    ),
+    ("a.bag", "#ROSBAG V2.0\n", "a ROS bag of version 2.0, which is not read: save a topic as .pcd"),
+    ("a.json", "[]", "a .json file, which is not read: save its points in Python"),
     ("a.dae", '<?xml version="1.0"?>\n<COLLADA xmlns="x" version="1.4.1">', "COLLADA of version 1.4.1, "),
     ("a.csv", "x y z base_color_r base_color_g base_color_b\n0 0 0 0 0 9\n", "from 0 to 9"),
     ("a.csv", "x y z roughness\n0 0 0 nan\n", "no point that can be used"),
