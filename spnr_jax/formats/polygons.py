@@ -74,7 +74,10 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
         _textured(columns, corners[np.repeat(own, sizes)], sizes[own], texcoords[np.repeat(own, sizes)], image)
         for image, own in wanted
     ]
-    if (rest := ~np.any([own for _, own in wanted], axis=0)).any():
+    rest = ~np.any([own for _, own in wanted], axis=0)
+    if not rest.any():
+        _describe_faces(of_faces, {}, loading)
+    else:
         loading.say(f"{rest.sum():,} of {len(rest):,} faces show no image of the file: their own colours taken")
         left = {name: column[rest] for name, column in of_faces.items()}
         parts += colored_part(vertices, corners[np.repeat(rest, sizes)], sizes[rest], left, loading)
@@ -97,7 +100,8 @@ def _textured(vertices: Columns, corners: np.ndarray, sizes: np.ndarray, texcoor
     normals = stack_columns(vertices, NORMAL)[corners] if set(NORMAL) <= vertices.keys() else None
     faces, _ = triangulate(positions, np.arange(len(positions)), sizes)
     material, texcoords = make_material(image.values(RGB, "sRGB")), texcoords * [1, -1] + [0, 1]
-    return Part(positions=positions, faces=faces, material=material, normals=normals, texcoords=texcoords)
+    alpha = np.where(invisible(vertices), 0.0, 1.0)[corners]
+    return Part(positions=positions, faces=faces, material=material, normals=normals, texcoords=texcoords, alpha=alpha)
 
 
 def _note_loose(corners: np.ndarray, count: int, loading: Loading) -> None:
@@ -181,7 +185,7 @@ def colored_part(
     faces, owner = triangulate(positions, corners, sizes)
     normals = stack_columns(columns, NORMAL) if set(NORMAL) <= columns.keys() else None
     alpha, (colors, notes) = np.where(invisible(columns), 0.0, 1.0), colors_of(columns) or (None, [])
-    used = dict[str, np.ndarray]()
+    used = Columns()
     if (found := _face_colors(of_faces, colors)) is not None:
         loading.ignored |= set() if colors is None else {"the one colour of all vertices, beside those of faces"}
         used = rename(of_faces)
@@ -194,9 +198,7 @@ def colored_part(
         colors = base_color(columns, loading.say)  # of intensities
     material = make_material(0.5 if colors is None else 1.0)
     loading.say(*notes)
-    taken = {"texnumber", *(name for name, x in of_faces.items() if any(x is own for own in used.values()))}
-    if left := [name for name in of_faces if name not in taken]:
-        loading.say(f"columns of faces that are not used: {list_names(left)}")
+    _describe_faces(of_faces, used, loading)
     return [Part(positions=positions, faces=faces, material=material, normals=normals, colors=colors, alpha=alpha)]
 
 
@@ -206,6 +208,13 @@ def _describe_vertices(vertices: Columns, loading: Loading) -> Columns:
     loading.say(*describe_use({name: x for name, x in vertices.items() if name not in sum(TEXCOORDS, ())}))
     loading.ignored |= {f"{name} of vertices" for name in UNREAD if name in columns}
     return columns
+
+
+def _describe_faces(of_faces: Columns, used: Columns, loading: Loading) -> None:
+    """Notes which columns of faces are not used."""
+    taken = {"texnumber", *(name for name, x in of_faces.items() if any(x is own for own in used.values()))}
+    if left := [name for name in of_faces if name not in taken]:
+        loading.say(f"columns of faces that are not used: {list_names(left)}")
 
 
 def _face_colors(of_faces: Columns, colors: np.ndarray | None) -> tuple[np.ndarray, list[str]] | None:

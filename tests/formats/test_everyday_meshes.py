@@ -106,6 +106,18 @@ def test_what_a_mesh_holds_and_is_not_used_is_said(tmp_path, line):
     assert line in read(write(tmp_path, *UNUSED[line]), num_points=9)[1]
 
 
+def test_beside_a_texture_alpha_is_used_and_what_is_not_used_is_said(tmp_path):
+    Image.new("RGB", (4, 4), GREEN).save(tmp_path / "wood.png")
+    of_vertex = "".join(f"property float {name}\n" for name in ("red", "green", "blue", "alpha", "quality"))
+    faces, of_face = 2 * [f"{UNIT_UV} 0 7"], TEXTURE + "property int flags\n"
+    content = two_squares_ply("comment TextureFile wood.png\n", of_vertex, of_face, "255 0 0 {2}0 1", faces)
+    cloud, lines = read(write(tmp_path, "a.ply", content), num_points=50)
+    assert is_green(cloud)
+    assert (cloud.positions[:, 2] == 5).all()
+    unused = {"columns that are not used: quality", "columns of faces that are not used: flags"}
+    assert unused | {"colours of the vertices not used beside those of a texture"} <= {*lines}
+
+
 def test_texture_coordinates_of_an_off_are_no_colours(tmp_path):
     content = "STOFF\n4 2 0\n" + "".join(f"{c} 0 1\n" for c in CORNERS) + TWO
     assert not any("not used" in line for line in read(write(tmp_path, "a.off", content), num_points=9)[1])

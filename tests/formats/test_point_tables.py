@@ -265,6 +265,11 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
         ),
         (
             "a.npz",
+            pack_arrays({"points": BALL, "data": np.zeros((30, 9))}),
+            "arrays that are not used, which name no column of the 420 points: data",
+        ),
+        (
+            "a.npz",
             pack_arrays({"v": BALL, "cd": np.uint8([GREEN] * 420)}),
             "base_color_r base_color_g base_color_b taken as",
         ),
