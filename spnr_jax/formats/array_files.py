@@ -112,9 +112,12 @@ def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
         table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
         columns = dict(zip(plain_names(table, report), table.T, strict=True))
-        wide = {name for name, x in arrays.items() if x.ndim > 1 and x.shape[1] > SINGLE and len(x) != len(table)}
-        single = {name for name, x in arrays.items() if np.size(x) <= SINGLE < len(table)}
-        others = [other for other in arrays if other in {*POSITION} | wide | single]
+        wide = {other for other, x in arrays.items() if x.shape[1:] > (SINGLE,) and len(x) != len(table)}
+        others = [
+            other
+            for other, x in arrays.items()
+            if other in POSITION or np.size(x) <= SINGLE < len(table) or other in wide
+        ]
         if others:
             report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
         arrays = {other: x for other, x in arrays.items() if other not in others}
