@@ -31,16 +31,20 @@ def look_at(
     return jnp.stack([right, jnp.cross(backward, right), backward, jnp.broadcast_to(eye, backward.shape)], axis=-1)
 
 
-def pinhole(cam_to_world: Float[Array, "*batch 3 4"], field_of_view: float, height: int, width: int) -> Camera:
+def pinhole(
+    cam_to_world: Float[Array, "*batch 3 4"], field_of_view: float | Float[AnyArray, "*#batch"], height: int, width: int
+) -> Camera:
     """Camera with a horizontal field of view in radians, square pixels and the principal point in the middle.
 
     ValueError for a field of view beyond 0 to pi, as of degrees.
     """
-    if isinstance(field_of_view, float | int | np.floating) and not 0 <= field_of_view < np.pi:
-        raise UserError(f"pinhole: field_of_view={field_of_view:g} is not from 0 to pi; expected radians")
-    focal = 0.5 * width / jnp.tan(0.5 * field_of_view)
-    intrinsics = jnp.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
-    intrinsics = jnp.broadcast_to(intrinsics, (*cam_to_world.shape[:-2], 3, 3))
+    for angle in () if isinstance(field_of_view, jax.core.Tracer) else np.ravel(field_of_view):
+        if not 0 <= angle < np.pi:
+            raise UserError(f"pinhole: field_of_view={angle:g} is not from 0 to pi; expected radians")
+    kind, batch = jnp.result_type(cam_to_world, jnp.float32), cam_to_world.shape[:-2]
+    focal = jnp.broadcast_to(0.5 * width / jnp.tan(0.5 * field_of_view), batch).astype(kind)
+    middle = jnp.array([[0, 0, 0.5 * width], [0, 0, 0.5 * height], [0, 0, 1]], kind)
+    intrinsics = jnp.broadcast_to(middle, (*batch, 3, 3)).at[..., (0, 1), (0, 1)].set(focal[..., None])
     return Camera(cam_to_world=cam_to_world, intrinsics=intrinsics, height=height, width=width)
 
 
@@ -101,21 +105,24 @@ def intersect_box(
 
 
 def orbit(
-    azimuth: float | Float[Array, ""],
-    elevation: float | Float[Array, ""],
-    distance: float | Float[Array, ""],
-    centre: Float[Array, "3"],
-) -> Float[Array, "3 4"]:
+    azimuth: float | Float[Array, "*#batch"],
+    elevation: float | Float[Array, "*#batch"],
+    distance: float | Float[Array, "*#batch"],
+    centre: Float[Array, "*#batch 3"],
+) -> Float[Array, "*#batch 3 4"]:
     """Pose that looks at `centre` from a distance; radians: azimuth around y from +z, elevation above the xz plane.
 
     Poses are continuous over the poles; beyond them the object stands on its head.
     """
+    azimuth, elevation, distance, _ = jnp.broadcast_arrays(azimuth, elevation, distance, centre[..., 0])
     horizontal, east, south = jnp.cos(elevation), jnp.sin(azimuth), jnp.cos(azimuth)
-    direction = jnp.stack([horizontal * east, jnp.sin(elevation), horizontal * south])
+    direction = jnp.stack([horizontal * east, jnp.sin(elevation), horizontal * south], axis=-1)
     # up where y is along the view
-    beside = -jnp.sign(jnp.sin(elevation)) * jnp.stack([east, jnp.zeros_like(east), south])
-    up = jnp.where(jnp.abs(horizontal) > 1e-6, jnp.sign(horizontal) * jnp.array([0.0, 1.0, 0.0]), beside)
-    return look_at(centre + distance * direction, centre, up)
+    beside = -jnp.sign(jnp.sin(elevation))[..., None] * jnp.stack([east, jnp.zeros_like(east), south], axis=-1)
+    upright = jnp.stack([jnp.zeros_like(east), jnp.sign(horizontal), jnp.zeros_like(east)], axis=-1)
+    up = jnp.where(jnp.abs(horizontal)[..., None] > 1e-6, upright, beside)
+    centre = jnp.broadcast_to(centre, direction.shape)
+    return look_at(centre + distance[..., None] * direction, centre, up)
 
 
 def is_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> bool:

@@ -167,6 +167,15 @@ def around(rng):
     return rng.uniform(-4, 4, 6), elevation, rng.uniform(1, 4, 6), rng.normal(size=(6, 3))
 
 
+def lenses(cam_to_world, field_of_view):
+    return cameras.pinhole(cam_to_world, field_of_view, 4, 6).intrinsics
+
+
+def lens_twin(cam_to_world, field_of_view):
+    focal = 3 / np.tan(field_of_view / 2)
+    return np.array([[focal, 0, 3], [0, focal, 2], [0, 0, 1]])
+
+
 def box(origins, directions):
     near, far, _ = cameras.intersect_box(origins, directions)
     return near, far - near
@@ -205,7 +214,9 @@ CAMERAS = (
     Law("project", project, each(project_twin, "(r,c),(k,k),(n,r)->(n,t),(n)"),
         (Axis("field of view", 0.7, 0.7, 0.7, before_eyes),), (2, 2, 2),
         Extremes((st.just((np.eye(3, 4), LENS, BESIDE_EYE)),)), agreement=1e-7),
-    Law("orbit", jax.vmap(cameras.orbit), each(orbit_twin, "(),(),(),(n)->(r,c)"), usual(around)),
+    Law("orbit", cameras.orbit, each(orbit_twin, "(),(),(),(n)->(r,c)"), usual(around), (0, 0, 0, 1)),
+    Law("pinhole", lenses, each(lens_twin, "(r,c),()->(k,k)"), usual(lambda rng: (views(rng, 1)[0], rng.random(6))),
+        (2, 0)),
     Law("intersect_box", box, each(box_twin, "(n),(n)->(),()"), sizes("distance of the camera", 1, 100, towards_box),
         (1, 1), Extremes((extremes(5, 3, low=-30, high=4), unit_vectors), floors=(FINITE, FINITE),
         check=touches_or_hits, twin=False)),

@@ -34,6 +34,7 @@ CALLS = {
     "encode(None, cloud.replace(base_color=None), near)": "encode: cloud.base_color is None, expected an array (9, 3)",
     "encode(None, cloud.replace(positions=np.full((9, 3), np.nan)), near)": "encode: cloud.positions has NaN or inf",
     "spnr_jax.cameras.pinhole(camera.cam_to_world, 40.0, 8, 8)": "pinhole: field_of_view=40 is not from 0 to pi",
+    "spnr_jax.cameras.pinhole(camera.cam_to_world, jax.numpy.float32(40), 8, 8)": "pinhole: field_of_view=40 is not",
     "spnr_jax.voxels.scatter_mean(rows[0], rows[1, :, 0], cloud.mask, 4)": "scatter_mean: positions, features and mask",
     "model.render(volume, camera.replace(cam_to_world=np.eye(4)))": "render: expected a pose (3, 4) and intrinsics",
     "light + 1": "unsupported operand type",
