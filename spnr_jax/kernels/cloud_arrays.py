@@ -110,7 +110,7 @@ def normalization(positions: np.ndarray) -> tuple[np.ndarray, np.float32]:
 
 def make_cloud(
     positions: Float[AnyArray, "points 3"],
-    base_color: Float[AnyArray, "points 3"] | Float[AnyArray, "3"] | tuple[float, float, float] | float = 0.5,
+    base_color: Float[AnyArray, "points 3"] | Float[AnyArray, "3"] | tuple[float | jax.Array, ...] | float = 0.5,
     roughness: Float[AnyArray, " points"] | float | None = None,
     metallic: Float[AnyArray, " points"] | float | None = None,
     normals: Float[AnyArray, "points 3"] | None = None,
@@ -128,11 +128,12 @@ def make_cloud(
 
     def column(name: str, values: Any) -> AnyArray:
         wanted = shape if name in VECTORS else shape[:1]
-        if np.shape(values) not in (wanted, wanted[1:], ()):
-            raise UserError(f"make_cloud: {name} has the shape {np.shape(values)}, expected {wanted}")
         if name == "base_color" and np.issubdtype(getattr(values, "dtype", float), np.integer):
             raise UserError("make_cloud: base_color holds whole numbers; expected linear floats from 0 to 1")
-        return xp.broadcast_to(xp.asarray(values, kind), wanted)
+        values = xp.asarray(values, kind)
+        if values.shape not in (wanted, wanted[1:], ()):
+            raise UserError(f"make_cloud: {name} has the shape {values.shape}, expected {wanted}")
+        return xp.broadcast_to(values, wanted)
 
     return PointCloud(
         positions=column("positions", positions),

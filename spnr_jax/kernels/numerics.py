@@ -107,8 +107,8 @@ def check_alike(where: str, image: Any, reference: Any) -> None:
 
 
 def array_namespace(*values: Any) -> ModuleType:
-    """jax.numpy if any value is a JAX array, traced or not; otherwise NumPy, which compiles nothing."""
-    return jnp if any(isinstance(x, jax.Array) for x in values) else np
+    """jax.numpy if any value is or holds a JAX array, traced or not; otherwise NumPy, which compiles nothing."""
+    return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(values)) else np
 
 
 def split_columns(x: Float[Array, "*batch features"]) -> list[Float[Array, "*batch"]]:

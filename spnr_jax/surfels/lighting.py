@@ -69,7 +69,7 @@ BLUR_LEVEL = 2  # index in LEVELS: this blurred table is sampled at the 64 visib
 SPECULAR = 0.04  # reflectance of dielectrics at normal incidence
 LOBE = 8.0  # sharpness of the lobe of visibility directions around the mirrored one
 POLE = 1e-6  # sine of the angle to the poles of a map below which a direction has no azimuth
-Color = Sequence[float | int] | np.ndarray | jax.Array
+Color = float | int | Sequence[float | int | jax.Array] | np.ndarray | jax.Array  # one number: grey
 SH_BANDS = 9  # spherical harmonics up to degree 2
 ODD = (3, 4, 7), (1, 4, 5)  # indices of the harmonics that change sign when the light is mirrored along x, or along y
 
@@ -98,7 +98,7 @@ def light_of(envmap: Float[AnyArray, "height width 3"]) -> Light:
         raise UserError(f"light_of: expected a map (height, 2 height, 3), got {shape}")
     if not isinstance(envmap, jax.core.Tracer):
         values = np.asarray(envmap)
-        if not (np.issubdtype(values.dtype, np.floating) and np.isfinite(values).all()):
+        if not (jnp.issubdtype(values.dtype, np.floating) and np.isfinite(values).all()):
             found = f"{values.dtype} from {values.min()} to {values.max()}"
             raise UserError(f"light_of: expected linear radiance in finite floats, got {found}")
     small = resample(envmap if xp is jnp else np.asarray(envmap, np.float32), HEIGHT)

@@ -140,7 +140,7 @@ def lamp(azimuth: Angle, elevation: Angle, size: Angle, irradiance: Color, heigh
     ramp = xp.clip((1.125 - angle / radius) * 4, 0, 1)
     disc = ramp * ramp * (3 - 2 * ramp)
     received = xp.sum(disc * xp.maximum(xp.cos(angle), 0) * solid_angles(height))
-    return (disc[..., None] * xp.asarray(irradiance)[None, None] / received).astype(np.float32)
+    return (disc[..., None] * xp.broadcast_to(xp.asarray(irradiance), (1, 1, 3)) / received).astype(np.float32)
 
 
 def sun(azimuth: Angle, elevation: Angle, size: Angle = 3.0, color: Color = (1, 1, 1)) -> Light:

@@ -34,7 +34,8 @@ def test_a_cloud_of_arrays_is_the_cloud_of_a_file_that_holds_them(tmp_path, know
 def test_one_value_holds_for_all_points():
     positions = sphere_points(3, 3)
     made = make_cloud(positions, (0.1, 0.2, 0.3), roughness=0.7)
-    np.testing.assert_array_equal(made.base_color, np.float32([[0.1, 0.2, 0.3]] * 3))
+    traced = jax.jit(lambda red: make_cloud(positions, (red, 0.2, 0.3)).base_color)(0.1)
+    np.testing.assert_array_equal([made.base_color, traced], np.float32([[[0.1, 0.2, 0.3]] * 3] * 2))
     np.testing.assert_array_equal([made.roughness, made.metallic], np.float32([[0.7] * 3, [0] * 3]))
 
 

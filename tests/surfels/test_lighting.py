@@ -1,5 +1,7 @@
 """Light from all around: integrals, linearity in the map, energy, the borders of a map; maps that are computed."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +43,7 @@ def test_the_room_of_the_package_is_what_its_map_gives():
 def test_all_tables_of_constant_light_are_that_light():
     light = light_of(np.broadcast_to(COLOR, (20, 40, 3)))
     close(light.tables, np.broadcast_to(COLOR, light.tables.shape), rtol=1e-4)
+    close(light_of(jnp.ones((20, 40, 3), jnp.bfloat16)).tables, np.ones(light.tables.shape), rtol=1e-4)
     towards = columns(numbers(0, 50, 3))
     for found in (irradiance(light, towards), reflect(light, towards, numbers(1, 50, low=0.0))):
         close(jnp.stack(found, axis=-1), np.broadcast_to(COLOR, (50, 3)), rtol=1e-4)
@@ -144,6 +147,13 @@ def test_lights_of_the_package_are_radiance_of_any_size_that_normalises_to_a_mea
         assert envmap.min() >= 0
         mean = (skies.normalise(envmap, 0.6) * solid_angles(height)[..., None]).sum() / (4 * np.pi * 3)
         assert mean == pytest.approx(0.6, rel=1e-3)
+
+
+@pytest.mark.parametrize("made", [lighting.ambient, partial(skies.sun, 40, 30, 20)])
+def test_a_color_is_an_array_or_one_number_or_three_traced_or_not(made):
+    expected = made(np.full(3, 0.5)).tables
+    close(made(0.5).tables, expected)
+    close(jax.jit(lambda x: made((x, x, 0.5)).tables)(0.5), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_random_maps_follow_from_their_generator_and_differ():
