@@ -28,7 +28,7 @@ from spnr_jax.kernels.numerics import (
     clamp,
     dot,
     measure_shape,
-    normalize_columns,
+    normalize,
     safe_sqrt,
     tangent_frame,
 )
@@ -57,14 +57,14 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> S
 
     One surfel per point, in the same order; `mask` is False for padding.
     `neighbors` are those of `spnr_jax.neighbors`: each point itself first, -1 for none.  Given normals are scaled to
-    length 1; where one is shorter than 1e-9, none is given.
+    length 1; where one is 0, none is given.
     """
     mask = jnp.asarray(cloud.mask)
 
     def columns(values: AnyArray) -> Array:
         return layers.select(mask, jnp.asarray(values).T, 0)
 
-    normals = None if cloud.normals is None else normalize_columns(columns(cloud.normals))
+    normals = None if cloud.normals is None else columns(normalize(jnp.asarray(cloud.normals)))
     points = PointColumns(
         neighbors=layers.select(mask, jnp.asarray(neighbors).T, -1),
         mask=mask,
