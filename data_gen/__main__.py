@@ -15,8 +15,7 @@ from data_gen.make.generate import generate
 from data_gen.plan.tasks import PRESETS, GenerateConfig
 from data_gen.store.check import check
 from data_gen.store.show import ShowConfig, show
-from spnr_jax.devices.arguments import parse as parse_options
-from spnr_jax.devices.arguments import split_debug, take_option
+from spnr_jax.devices.arguments import parse as parse_options, split_debug, take_option
 from spnr_jax.errors import UserError, guard
 
 DESCRIPTION = """Data sets of rendered objects and their surface points.

@@ -5,6 +5,7 @@
 
 import warnings
 from importlib import import_module, metadata
+from typing import TYPE_CHECKING
 
 from jaxlib import version  # without JAX
 
@@ -20,6 +21,40 @@ _PUBLIC |= dict.fromkeys(
     ("PointCloud", "Camera", "Light", "Gaussians", "Rays", "Rendering", "Batch"), "kernels.records"
 )
 _KERNELS = ("cameras", "sampling", "compositing", "voxels", "losses", "metrics")
+
+if TYPE_CHECKING:  # the same names, for type checkers and editors
+    from spnr_jax.formats.camera_files import read_cameras as read_cameras
+    from spnr_jax.formats.clouds import read_cloud as read_cloud
+    from spnr_jax.formats.gaussian_files import write_splats as write_splats
+    from spnr_jax.formats.images import read_light as read_light
+    from spnr_jax.kernels import (
+        cameras as cameras,
+        compositing as compositing,
+        losses as losses,
+        metrics as metrics,
+        sampling as sampling,
+        voxels as voxels,
+    )
+    from spnr_jax.kernels.cleaning import clean as clean
+    from spnr_jax.kernels.cloud_arrays import make_cloud as make_cloud
+    from spnr_jax.kernels.records import (
+        Batch as Batch,
+        Camera as Camera,
+        Gaussians as Gaussians,
+        Light as Light,
+        PointCloud as PointCloud,
+        Rays as Rays,
+        Rendering as Rendering,
+        Volume as Volume,
+    )
+    from spnr_jax.method.densifier import densify as densify
+    from spnr_jax.method.model import Model as Model
+    from spnr_jax.method.surfel_renderer import Plan as Plan, encode as encode, plan as plan, render as render
+    from spnr_jax.surfels.lighting import ambient as ambient, light_of as light_of
+    from spnr_jax.surfels.neighbors import neighbors as neighbors
+    from spnr_jax.surfels.skies import sun as sun
+    from spnr_jax.tools.surfaces import splats as splats
+    from spnr_jax.training.weights import load as load
 
 WRONG = {"0.10.2": "jax-ml/jax#39103"}  # versions of jaxlib that compute wrong numbers -> the issue
 

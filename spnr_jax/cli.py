@@ -16,8 +16,7 @@ import tyro
 
 from spnr_jax import methods, presets
 from spnr_jax.devices import runtime
-from spnr_jax.devices.arguments import parse as parse_options
-from spnr_jax.devices.arguments import split_debug, take_option
+from spnr_jax.devices.arguments import parse as parse_options, split_debug, take_option
 from spnr_jax.errors import STOPPED, UserError, guard, one_line, require, stop_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View
 

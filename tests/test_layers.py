@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import spnr_jax
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("spnr_jax", "data_gen", "experiments")
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
@@ -60,6 +62,13 @@ def test_importing_the_package_is_light_and_its_kernels_are_one_module_under_bot
     assert not alone & (HEAVY | {"jax", "flax", "optax", "orbax", "scipy"} | {f"spnr_jax.{name}" for name in KERNELS})
     same = (f"from spnr_jax import {name}; import spnr_jax.kernels.{name} as k; assert k is {name}" for name in KERNELS)
     modules_after("; ".join(same))
+
+
+def test_type_checkers_see_the_names_that_are_imported_at_their_first_use():
+    typed = next(node for node in ast.parse(Path(spnr_jax.__file__).read_text()).body if isinstance(node, ast.If))
+    seen = {name.asname: node.module for node in typed.body for name in node.names}
+    imported = {name: f"spnr_jax.{module}" for name, module in spnr_jax._PUBLIC.items()}
+    assert seen == imported | dict.fromkeys(spnr_jax._KERNELS, "spnr_jax.kernels")
 
 
 @pytest.mark.ci  # it draws one in a process of its own

@@ -8,8 +8,7 @@ import gzip
 
 import numpy as np
 import pytest
-from support import chromium as chromium_of
-from support import splat_balls, three_js
+from support import chromium as chromium_of, splat_balls, three_js
 from support.point_clouds import BALL, GREEN, LINEAR, packed_splats, write
 
 from spnr_jax.config import Cut

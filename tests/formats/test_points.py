@@ -8,8 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from support.point_clouds import BALL, GREEN, LINEAR, SRGB, XYZRGB, ply_bytes, read, write
 from support.point_tables import BROKEN, SOUND, WHOLE, WRITERS, as_npy, compress_lzf, written
 

@@ -16,8 +16,7 @@ import numpy as np
 import paper_laws
 import pytest
 import surfel_laws
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from support.laws import Axis, Law, batch_law, close, extremes_law, hypotheses, in_both_precisions, points_law
 
 TABLE = (*surfel_laws.LAWS, *kernel_laws.LAWS, *paper_laws.LAWS)

@@ -29,8 +29,7 @@ from random import Random
 import numpy as np
 import pytest
 from file_readers import READERS, Files
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from watched import limited_memory, watched
 
 from spnr_jax.errors import one_line

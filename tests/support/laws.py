@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import Phase, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, settings, strategies as st
 
 
 def numbers(seed: int, *shape: int, low: float = -1.0, high: float = 1.0) -> jax.Array:

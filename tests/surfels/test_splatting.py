@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from support import reference
 from support.laws import close, hypotheses
 from support.surfel_clouds import camera, even_square, shape, surfels

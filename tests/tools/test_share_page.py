@@ -11,8 +11,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
-from support import chromium as chromium_of
-from support import splat_balls, splat_twin
+from support import chromium as chromium_of, splat_balls, splat_twin
 
 from spnr_jax.tools import export, surfaces
 from spnr_jax.tools.commands import Share, SplatOptions
