@@ -18,4 +18,4 @@ def run(main: Callable[[Any], object], options: type, name: str) -> NoReturn:
         cli.set_up_jax()
         main(parsed)
 
-    sys.exit(errors.guard(work, name.rpartition(".")[2], debug))
+    errors.leave(errors.guard(work, name.rpartition(".")[2], debug))

@@ -5,7 +5,6 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 
 import dataclasses
 import importlib.util
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import tyro
 from spnr_jax import methods, presets
 from spnr_jax.devices import runtime
 from spnr_jax.devices.arguments import parse as parse_options, split_debug, take_option
-from spnr_jax.errors import STOPPED, UserError, guard, one_line, require, stop_at_once
+from spnr_jax.errors import UserError, guard, leave, one_line, require, stop_at_once
 from spnr_jax.tools.commands import Evaluate, Export, Render, Share, Train, View
 
 DESCRIPTION = """Sparse-point neural rendering: train a network, evaluate one, render a cloud of points.
@@ -33,10 +32,8 @@ def main(arguments: list[str] | None = None) -> None:
     whole = arguments is None  # process
     arguments, debug = split_debug(sys.argv[1:] if arguments is None else arguments)
     code = guard(lambda: run(parse(arguments)), "spnr", debug)
-    if code == STOPPED and whole:  # Python's end crashes of what JAX still compiles
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    if whole:
+        leave(code)
     sys.exit(code)
 
 

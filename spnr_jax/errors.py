@@ -13,7 +13,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from types import UnionType
-from typing import Any
+from typing import Any, NoReturn
 
 JSON = (dict, list, str, int, float, bool, type(None))
 LONGEST_LINE = 800  # characters of an error
@@ -158,6 +158,15 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+def leave(code: int) -> NoReturn:
+    """Ends the process; after a stop without Python's end, which crashes of what JAX still compiles or computes."""
+    if code == STOPPED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 @contextlib.contextmanager
