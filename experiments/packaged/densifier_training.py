@@ -37,6 +37,7 @@ from spnr_jax.surfels import geometry, sides, symmetry
 from spnr_jax.surfels.candidates import CANDIDATES, Candidates, Nodes, build_graph
 from spnr_jax.surfels.geometry import PointColumns
 from spnr_jax.surfels.neighbors import order_in_space
+from spnr_jax.training.trainer import check_finite
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
@@ -50,6 +51,7 @@ UNLIKE = 0.12  # squared spacings that a normal at right angles counts as
 HIDDEN = 0.1  # weight of what nothing outside sees
 EXACT = 0.08  # spacings off the surface at which a learned point is half there
 ROBUST = 0.15  # and at which errors begin to count less
+OF_KEPT = "off", "cosine", "good"  # metrics of the learned points that are kept, summed by weight
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,9 +334,8 @@ def measure_loss(params: dict, batch: Batch) -> tuple[Array, dict[str, Array]]:
     }
     factors = {"learned": 4.0, "normal": 0.6, "existence": 0.4, "color": 0.6, "cover": 1.5}
     kept = weight * (likely > 0.5)
-    share = jnp.sum(kept)
-    metrics = parts | {"off": jnp.sum(kept * off) / share, "kept": share, "cosine": jnp.sum(kept * cosine) / share}
-    metrics["good"] = jnp.sum(kept * quality) / share
+    of_kept = zip(OF_KEPT, (off, cosine, quality), strict=True)
+    metrics = parts | {"kept": jnp.sum(kept)} | {name: jnp.sum(kept * value) for name, value in of_kept}
     return sum((factors[name] * value for name, value in parts.items()), jnp.zeros(())), metrics
 
 
@@ -382,6 +383,7 @@ def train(options: Options) -> None:
         leaves, structure = jax.tree.flatten(state)
         found = read(checkpoint)
         state = jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])
+        print(f"resuming at step {state['step']} of {options.steps}", flush=True)
 
     @jax.jit
     def advance(params: dict, rule_state: Any, batch: Batch) -> tuple[dict, Any, dict[str, Array]]:
@@ -395,17 +397,23 @@ def train(options: Options) -> None:
         batch = jax.tree.map(lambda *x: np.stack(x), *parts)
         state["params"], state["rule"], metrics = advance(state["params"], state["rule"], batch)
         sums.append(jax.device_get(metrics))
+        check_finite([(step + 1, sums[-1])])
         if step % 100 == 99 or step == 9:
-            mean = {name: np.mean([x[name] for x in sums]) for name in sums[0]}
-            shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
-            print(f"{step + 1} {time.time() - begin:.0f} s {shown}", flush=True)
+            print(f"step {step + 1}, {time.time() - begin:.0f} s: {describe(sums)}", flush=True)
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1
-            kept = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-            write_whole(checkpoint, pack_arrays(kept))
             flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(state["params"], sep="/").items()}
             write_whole(options.out / "densifier.npz", pack_arrays(flat, compressed=True))
+            kept = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+            write_whole(checkpoint, pack_arrays(kept))  # last: a training that is killed before it makes both again
+
+
+def describe(steps: list[dict[str, np.ndarray]]) -> str:
+    """Mean metrics of steps; those of OF_KEPT are means over the learned points that are kept, NaN if none is."""
+    mean = {name: float(np.mean([metrics[name] for metrics in steps])) for name in steps[0]}
+    mean |= {name: mean[name] / (mean["kept"] or np.nan) for name in OF_KEPT}
+    return " ".join(f"{name} {value:.4f}" for name, value in mean.items())
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
