@@ -34,11 +34,14 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_within(options: Any, low: float | int, high: float | int, *names: str) -> None:
-    """UserError for the first of these options that is given and smaller or larger."""
+    """UserError for the first of these options that is given and smaller or larger, or has such a number, or none."""
+    wanted = f"{low} or more" if high == math.inf else f"{low} to {high}"
     for name in names:
-        value, wanted = getattr(options, name), f"{low} or more" if high == math.inf else f"{low} to {high}"
-        if value is not None and not low <= value <= high:
-            raise UserError(f"--{name.replace('_', '-')}: expected {wanted}, got {value}")
+        found = getattr(options, name)
+        values = found if isinstance(found, tuple) else (found,)
+        if not values or not all(value is None or low <= value <= high for value in values):
+            got = " ".join(map(str, values)) or "nothing"
+            raise UserError(f"--{name.replace('_', '-')}: expected {wanted}, got {got}")
 
 
 def require_at_least(options: Any, least: float | int, *names: str) -> None:

@@ -14,18 +14,19 @@ from spnr_jax.scoring import evaluation
 from spnr_jax.training.gbuffers import average_squares
 
 
-def test_objects(dataset: Dataset, count: int | None, points: int) -> tuple[str, ...]:
-    """Test objects, evenly out of the split, or all of them; ValueError if there is none, or if they lack points."""
+def test_objects(dataset: Dataset, count: int | None, points: int, *resolutions: int | None) -> tuple[str, ...]:
+    """Test objects, evenly out of the split, or all; ValueError if there is none, or as they lack points or pixels."""
     names = dataset.splits["test"]
     if not names:
         raise UserError(f"{dataset.folder}: the test split is empty; generate more objects")
-    if count is not None and count < 1:
-        raise UserError(f"--objects: expected 1 or more, got {count}")
-    if (held := len(data_sets.read_object(dataset, names[0]).cloud.mask)) < points:
+    first = data_sets.read_object(dataset, names[0])
+    if (held := len(first.cloud.mask)) < points:
         raise UserError(
             f"{dataset.folder}: {points:,} points of an object are asked for, {held:,} are there; ask for fewer, or "
             f"generate it with --points {points}"
         )
+    for resolution in resolutions:
+        cut(first, resolution=resolution)
     return evaluation.pick_evenly(names, count or len(names))
 
 

@@ -58,7 +58,7 @@ class Budget:
     def __post_init__(self) -> None:
         if self.steps is not None and (self.quick or self.steps < 1):
             raise UserError(f"--steps: expected 1 or more, and not together with --quick, got {self.steps}")
-        require_at_least(self, 1, "shown")
+        require_at_least(self, 1, "objects", "shown")
 
     def config(self) -> TrainConfig:
         """The preset with the steps and the seed of this budget."""

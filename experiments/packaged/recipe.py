@@ -28,6 +28,7 @@ from experiments.packaged import densifier_training
 from experiments.packaged.demo import Seconds
 from spnr_jax import presets
 from spnr_jax.config import Quality
+from spnr_jax.errors import require_within
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.images import write_whole
 from spnr_jax.kernels.cloud_arrays import farthest_points
@@ -65,6 +66,9 @@ class Recipe:
     """Rendering processes (default: one per CPU core)."""
     seed: int = 0
     """Seed of the data and of the shader's training; the densifier's is fixed."""
+
+    def __post_init__(self) -> None:
+        require_within(self, 0.01, 1, "share")  # of two procedural objects one is left to train on
 
 
 def main(recipe: Recipe) -> None:

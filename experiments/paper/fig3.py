@@ -30,7 +30,7 @@ from experiments.comparison.scores import OPAQUE, Measured
 from experiments.comparison.study_objects import cut, each_view, test_objects
 from experiments.comparison.view_scores import mean
 from spnr_jax.devices import runtime
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.formats.images import depth_image
@@ -49,8 +49,9 @@ COLUMNS = {  # head, decimals
 }
 SPHERE = 10  # radius, in distances of the farthest point, of the sphere that tells which points the eye sees
 NOTE = (
-    "Distances are along the rays, in half diagonals of the object's box. Means over objects with 95 % intervals. "
-    "Errors at opaque pixels that see a point of the data set; floaters are opaque pixels where the reference is empty."
+    "Distances are along the rays, in half diagonals of the object's box. Means over objects, from five on with 95 % "
+    "intervals. Errors at opaque pixels that see a point of the data set; floaters are opaque pixels where the "
+    "reference is empty."
 )
 
 
@@ -72,6 +73,9 @@ class Fig3:
     """Objects in the picture."""
     quick: bool = False
     """A check that everything works: two objects."""
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "points", "objects", "shown")
 
 
 def main(options: Fig3) -> None:

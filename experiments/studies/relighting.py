@@ -26,7 +26,7 @@ from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import mean
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
-from spnr_jax.errors import UserError
+from spnr_jax.errors import UserError, require_at_least
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.imaging import srgb_to_linear
@@ -67,6 +67,9 @@ class RelightingStudy:
     objects: int | None = None
     """Test objects (default: all)."""
 
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "counts", "resolution", "views", "objects")
+
 
 def main(options: RelightingStudy) -> None:
     """Draws, scores and writes."""
@@ -74,14 +77,15 @@ def main(options: RelightingStudy) -> None:
     found: Found = {}
     columns: dict[str, list[np.ndarray]] = {}
     datasets = [data_sets.open_dataset(folder) for folder in options.data]
-    names, *others = (test_objects(dataset, options.objects, max(options.counts)) for dataset in datasets)
+    asked = options.objects, max(options.counts), options.resolution
+    names, *others = (test_objects(dataset, *asked) for dataset in datasets)
     if any(other != names for other in others):
         raise UserError("--data: expected data sets of the same test objects, these hold others")
     for dataset in datasets:
         check_known_light(model.config, dataset)
         light = name_of(dataset)
-        asked = {"run": run, "views": options.views, "objects": names, "resolution": options.resolution}
-        results_folder.claim(options.out / "scores" / light, "relighting", asked, dataset)
+        claimed = {"run": run, "views": options.views, "objects": names, "resolution": options.resolution}
+        results_folder.claim(options.out / "scores" / light, "relighting", claimed, dataset)
         rows = {f"{light}/{count:,} points": partial(measure, options, model, count) for count in options.counts}
         measured = scores.measure_rows(options.out, rows, dataset, names, names[:GALLERY])
         found |= {(light, count): of for count, of in zip(options.counts, measured.values(), strict=True)}
@@ -139,7 +143,7 @@ def _write(out: Path, found: Found) -> None:
         for (light, count), objects in found.items()
         for method in METHODS
     }
-    note = "Means over objects with 95 % intervals; pictures are never rescaled."
+    note = "Means over objects, from five on with 95 % intervals; pictures are never rescaled."
     table = scores.score_table("Relighting", rows, COLUMNS, note)
     results_folder.write(out, {"objects": rows, "hardware": runtime.describe_hardware()}, [table])
 

@@ -37,6 +37,7 @@ from experiments.comparison.scores import Measured
 from experiments.comparison.study_objects import cut, test_objects
 from spnr_jax.config import NetworkConfig, Quality
 from spnr_jax.devices import runtime
+from spnr_jax.errors import require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels import cameras
@@ -170,6 +171,9 @@ class SpeedAccuracy:
     quick: bool = False
     """A few settings of each network, for a test."""
 
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "sizes", "counts", "objects", "views")
+
 
 class Row(NamedTuple):
     """A setting of a run at a size, and what measures it."""
@@ -197,9 +201,9 @@ class Row(NamedTuple):
 def main(options: SpeedAccuracy) -> None:
     """Measures the settings that are not measured, then writes the tables and the plot."""
     dataset = data_sets.open_dataset(options.data)
-    names = test_objects(dataset, options.objects, max(options.counts))
     for run in options.runs:
         check_known_light(load(run).config, dataset)
+    names = test_objects(dataset, options.objects, max(options.counts), *options.sizes)
     asked = {"objects": names, "views": options.views, "runs": list(checksums(options.runs).items())}
     results_folder.claim(options.out, "speed_accuracy", asked, dataset)
     rows = [row for number in range(len(options.runs)) for row in rows_of(number, options, names)]

@@ -31,7 +31,7 @@ def _tiny(monkeypatch):
 
 
 def test_one_command_makes_data_both_networks_and_scores_and_then_has_nothing_left_to_do(tmp_path, capsys):
-    options = recipe.Recipe(out=tmp_path / "w", share=0.004, workers=1)
+    options = recipe.Recipe(out=tmp_path / "w", share=0.01, workers=1)
     recipe.main(options)
     run = options.out / "run"
     own, packaged = read_trained(run).variables["densifier"], read_variables(packaged_file("densifier"))

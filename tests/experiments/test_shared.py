@@ -15,6 +15,7 @@ from support import tiny_dataset
 
 from experiments.comparison import contenders, results_folder, scores, study_objects, variants
 from experiments.paper import fig3
+from experiments.studies import inverse
 from spnr_jax.formats import data_sets
 from spnr_jax.scoring import evaluation
 from spnr_jax.training import weights
@@ -103,12 +104,17 @@ def test_what_cannot_be_compared_is_refused_by_name(monkeypatch):
     with pytest.raises(ValueError, match="--runs: none of these predicts depth"):
         fig3.all_methods(("npbg",))
     dataset = tiny_dataset.dataset()
-    with pytest.raises(ValueError, match="--objects: expected 1 or more, got 0"):
-        study_objects.test_objects(dataset, 0, 1)
     with pytest.raises(ValueError, match="the test split is empty"):
         study_objects.test_objects(dataclasses.replace(dataset, splits={"test": ()}), None, 1)
     with pytest.raises(ValueError, match=r"4,097 points of an object .* are there; .* generate it with --points 4097"):
         study_objects.test_objects(dataset, None, 4097)
+    with pytest.raises(ValueError, match="5 pixels along a side are not a whole share of the data set's"):
+        study_objects.test_objects(dataset, None, 1, None, 5)
+
+
+def test_gradients_are_shown_of_the_objects_that_were_compared_alone():
+    _, apart = inverse.make_tables({}, {"light": [[2.0, 1.0]]}, ["ball", "ring"])
+    assert (apart.heads, apart.rows[0][1][0].text) == (("ball",), "100.0000")
 
 
 def test_a_run_that_was_trained_further_is_another_network(monkeypatch):
