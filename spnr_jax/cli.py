@@ -5,6 +5,7 @@ Errors of the user and of the disk are one line on stderr and exit code 2; Ctrl-
 
 import dataclasses
 import importlib.util
+import shlex
 import sys
 import time
 from collections.abc import Callable
@@ -92,7 +93,9 @@ def run_train(command: Train) -> None:
     dataset = data_sets.open_dataset(command.data)
     init = None if command.init is None else weights.read_trained(command.init)
     trainer.train(command.config, dataset, command.run, command.schedule, programs.device_mesh(), init)
-    print(f"trained: {command.run} (score it with `spnr evaluate {command.data} {command.run}`)")
+    source = methods.method_of(command.config.model).source
+    scoring = "spnr", "evaluate", str(command.data), str(command.run), *(("--methods", source) if source else ())
+    print(f"trained: {command.run} (score it with `{shlex.join(scoring)}`)")
 
 
 def run_evaluate(command: Evaluate) -> None:

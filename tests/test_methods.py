@@ -1,7 +1,10 @@
 """The method that the documents show is trained, scored, written and loaded like ours; no file imports it by itself."""
 
+import contextlib
+import io
 import json
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -42,7 +45,9 @@ def run(tmp_path_factory):
         patch.chdir(folder)
         data = tiny_dataset.dataset().folder
         asked = ("train", data, "run", "--methods", "my_method.py", "--preset", "mean_color")
-        assert command_line.exit_code(cli, *asked, "--image-resolution", str(tiny_dataset.SIZE)) == 0
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            assert command_line.exit_code(cli, *asked, "--image-resolution", str(tiny_dataset.SIZE)) == 0
+        assert said.getvalue().endswith(f"`spnr evaluate {shlex.quote(str(data))} run --methods my_method.py`)\n")
         described = json.loads((folder / "run" / "config.json").read_text())["model"]
         assert (described["method"], described["source"]) == ("mean_color", "my_method.py")
         trained = weights.read_trained("run")
