@@ -84,7 +84,8 @@ def main(recipe: Recipe) -> None:
     seconds.measure("shader", lambda: trainer.train(config, dataset, run, trainer.Schedule()))
     rows = score(run, dataset)
     write_whole(recipe.out / "scores.json", (json.dumps(rows, indent=1) + "\n").encode())
-    print(f"weights: {run / 'weights.npz'} and densifier.npz; seconds: {seconds.values}")
+    spent = ", ".join(f"{part} {value:.0f} s" for part, value in seconds.values.items())
+    print(f"weights: {run / 'weights.npz'} and densifier.npz; {spent}")
 
 
 def scale(recipe: Recipe, count: int) -> int:

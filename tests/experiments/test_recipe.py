@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def test_one_command_makes_data_both_networks_and_scores_and_then_has_nothing_le
     assert all(np.isfinite(row["psnr"]) and row["psnr"] > 3 for row in rows.values())
     assert load(run).config == tiny_surfels.CONFIG.model
     made = {path: path.stat().st_mtime_ns for path in (options.out / "densifier" / "records").iterdir()}
-    capsys.readouterr()
+    assert re.search(r"densifier\.npz; data \d+ s, densifier \d+ s, shader \d+ s$", capsys.readouterr().out.rstrip())
     recipe.main(options)
     assert made == {path: path.stat().st_mtime_ns for path in made}
     assert "is finished: 1 steps" in capsys.readouterr().out
