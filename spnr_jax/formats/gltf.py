@@ -309,7 +309,7 @@ def read_material(file: GltfFile, index: int | None) -> tuple[Material | None, P
     read = partial(_read_texture, file, places)
     glossy = extensions.get(SPECULAR_GLOSSINESS)
     look, of_color = (spec.get("pbrMetallicRoughness", {}), "baseColor") if glossy is None else (glossy, "diffuse")
-    if UNLIT in extensions and not loading.strict:  # means no metal
+    if UNLIT in extensions and not loading.strict and "metallicRoughnessTexture" not in look:  # means no metal
         look = {"metallicFactor": 0.0, "roughnessFactor": 0.5} | look
     color, factor = read(look.get(f"{of_color}Texture"), GREY), look.get(f"{of_color}Factor", (1, 1, 1, 1))
     base_color = _scaled(color, RGB, factor[:3], "sRGB")

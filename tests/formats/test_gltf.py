@@ -145,6 +145,16 @@ def test_a_part_without_a_material_is_a_rough_metal_for_references_and_none_for_
         assert any("parts without a material" in note for note in asset.notes) == (expected == (0.5, 0) and not unlit)
 
 
+def test_the_texture_of_roughness_and_metallic_of_an_unlit_material_keeps_its_values(tmp_path):
+    builder = GltfBuilder()
+    surface = {"index": builder.texture(np.full((2, 2, 3), 255, np.uint8))}
+    unlit = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicRoughnessTexture": surface}}
+    builder.mesh(builder.primitive(material=builder.material(**unlit), TEXCOORD_0=UV))
+    look = load_mesh(builder.write(tmp_path / "a.glb"), transparent_parts="opaque").parts[0].material
+    assert (look.roughness == 1).all()
+    assert (look.metallic == 1).all()
+
+
 @pytest.mark.parametrize(("mode", "order"), [(4, SQUARE), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
 def test_strips_fans_and_lists_describe_the_same_square(tmp_path, mode, order):
     (part,) = one_square(tmp_path, indices=np.array(order, np.uint16), mode=mode).parts
