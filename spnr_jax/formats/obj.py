@@ -124,9 +124,11 @@ def _columns(text: Rests, loading: Loading) -> Columns:
     ones = (table[:, 3:] == 1).all(axis=0).tolist()
     if len(ones) == 4 and ones[0] and not (ones[3] or all(ones[:3])):  # weights of the vertices, not white and alpha
         table = np.delete(table, 3, axis=1)
-    if table.shape[1] in (4, 5) and (table[:, 3:] != 1).any():
+    width = table.shape[1]
+    used = 3 if width < 6 else 6 if width > 7 else width  # behind colours: alpha alone, but no normal
+    if (table[:, used:] != 1).any():
         loading.ignored.add("numbers behind the coordinates of vertices")
-    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T if table.shape[1] >= 6 else table.T[:3], strict=False))
+    columns = dict(zip((*"xyz", *SRGB, "alpha"), table.T[:used], strict=False))
     digits = "".join(text[POLYPAINT])[: 8 * len(table)]
     if len(digits) == 8 * len(table) and re.fullmatch("[0-9a-fA-F]*", digits):
         columns |= dict(zip(SRGB, np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 4).T[1:], strict=True))

@@ -106,6 +106,13 @@ def test_what_a_mesh_holds_and_is_not_used_is_said(tmp_path, line):
     assert line in read(write(tmp_path, *UNUSED[line]), num_points=9)[1]
 
 
+def test_normals_behind_the_colours_of_an_obj_are_no_alpha(tmp_path):
+    content = by_corner("".join(f"v {c} 1 1 0 ? 0 1\n" for c in CORNERS), 0, 0, 0, 1) + TWO_OF_OBJ
+    lines = read(write(tmp_path, "a.obj", content), num_points=9)[1]
+    assert "ignored: numbers behind the coordinates of vertices" in lines
+    assert not any("alpha" in line for line in lines)
+
+
 def test_beside_a_texture_alpha_is_used_and_what_is_not_used_is_said(tmp_path):
     Image.new("RGB", (4, 4), GREEN).save(tmp_path / "wood.png")
     of_vertex = "".join(f"property float {name}\n" for name in ("red", "green", "blue", "alpha", "quality"))
