@@ -18,6 +18,7 @@ import numpy as np
 from spnr_jax.errors import UserError
 from spnr_jax.formats.assets import RGB, Loading, Part, Texels, make_material
 from spnr_jax.formats.columns import (
+    LINEAR,
     NORMAL,
     SRGB,
     Columns,
@@ -67,7 +68,7 @@ def load_ply_mesh(path: Path, loading: Loading) -> list[Part]:
     if len(number) and (number.min(), number.max()) == (1, len(images)):  # counted from 1
         number = number - 1
     columns = _describe_vertices(vertices, loading)
-    if colors_of(columns):
+    if columns.keys() & {LINEAR[0], SRGB[0], "rgb", "rgba"}:
         loading.say("colours of the vertices not used beside those of a texture")
     wanted = [(image, number == i) for i, image in enumerate(images) if image is not None]
     parts = [

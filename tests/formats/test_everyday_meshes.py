@@ -117,7 +117,7 @@ def test_beside_a_texture_alpha_is_used_and_what_is_not_used_is_said(tmp_path):
     Image.new("RGB", (4, 4), GREEN).save(tmp_path / "wood.png")
     of_vertex = "".join(f"property float {name}\n" for name in ("red", "green", "blue", "alpha", "quality"))
     faces, of_face = 2 * [f"{UNIT_UV} 0 7"], TEXTURE + "property int flags\n"
-    content = two_squares_ply("comment TextureFile wood.png\n", of_vertex, of_face, "255 0 0 {2}0 1", faces)
+    content = two_squares_ply("comment TextureFile wood.png\n", of_vertex, of_face, "1.5 0 0 {2}0 1", faces)
     cloud, lines = read(write(tmp_path, "a.ply", content), num_points=50)
     assert is_green(cloud)
     assert (cloud.positions[:, 2] == 5).all()
