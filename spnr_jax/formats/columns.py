@@ -129,8 +129,8 @@ def rename(columns: Columns) -> Columns:
         if ours[0] not in found:
             found |= dict(zip(ours, map(columns.__getitem__, _differing(columns, words)), strict=False))
     colored = any(set(names) <= found.keys() for names in (LINEAR, SRGB, ("rgb",)))
-    # without colours, `a` may mean anything; of color_1 ... color_3 the last is no alpha
-    if found.get("alpha") is (found.get("blue") if colored else plain.get("a")):
+    # without colours only `alpha` is one, `a` may mean anything; of color_1 ... color_3 the last is none
+    if found.get("alpha") is found.get("blue") if colored else "alpha" not in plain:
         found.pop("alpha", None)
     if set(SPLAT) <= columns.keys():
         for name, constant in zip(SRGB, SPLAT, strict=True):

@@ -268,6 +268,7 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             pack_arrays({"points": BALL, "data": np.zeros((30, 9))}),
             "arrays that are not used, which name no column of the 420 points: data",
         ),
+        ("a.csv", "x,y,z,af,s\n" + GREYS, "columns that are not used: af, s"),
         (
             "a.npz",
             pack_arrays({"v": BALL, "cd": np.uint8([GREEN] * 420)}),
