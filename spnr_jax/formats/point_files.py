@@ -66,7 +66,7 @@ FOREIGN = (
     ("COLLADA", ".dae", rb"<.{,400}<COLLADA\s[^>]*version=\"([\d.]+)", BLENDER),
     ("", ".usd .usda .usdc .3ds .blend .x3d .abc", b"", BLENDER),
     ("", ".3mf .dxf .ctm .max .c4d .ma .mb", b"", "export it as a mesh (.glb .obj .stl)"),
-    ("Houdini's geometry", ".geo .bgeo", rb"\x7fNSJb", "convert it with Houdini's `gconvert a.bgeo a.ply`"),
+    ("Houdini's geometry", ".bgeo", rb"\x7fNSJb|PGEOMETRY|\[\s*\"fileversion", "convert it by `gconvert a.bgeo a.ply`"),
     ("a CAD file", ".step .stp .iges .igs .3dm .skp .ifc", b"", "export it as a mesh (.glb .obj .stl)"),
     ("3D Tiles", ".b3dm .i3dm .pnts .cmpt", b"", "convert it to .glb or .las first"),
     ("E57", ".e57", rb"ASTM-E57(.{4})(.{4})", CLOUDCOMPARE),

@@ -120,6 +120,8 @@ REFUSED = [
     ("a.jpeg", "1 2 3", f"unknown kind of file '.jpeg'; {KNOWN}"),
     ("a.txt", "# 3D point list with one line\n", "COLMAP's points, which is not read: .* .colmap model_converter"),
     ("a.npy", as_npy(np.zeros((4, 5, 3), "u1")), "bytes of a picture"),
+    ("a.geo", "Point(1) = {0, 0, 0};\n", "unknown kind of file '.geo'"),  # of Gmsh
+    ("a.geo", '[\n\t"fileversion","19",', "Houdini's geometry, which is not read: convert it by `gconvert"),
     ("nurbs.obj", "v 0 0 0\nv 0 1 0\nsurf 0 1 0 1 1 2\n", "curves .NURBS., which are not read"),
     ("curve.obj", "v 0 0 0\nv 0 1 0\ncstype bspline\ncurv 0 1 1 2 3 4\nend\n", "curves .NURBS."),
     ("a.off", "OFF BINARY\n", "not an OFF file that can be read"),
