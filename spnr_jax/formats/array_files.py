@@ -16,7 +16,18 @@ from pathlib import Path
 import numpy as np
 
 from spnr_jax.errors import UserError, refusing
-from spnr_jax.formats.columns import ARRAYS, PLACES, POSITION, Columns, Report, list_names, name_columns, plain_name
+from spnr_jax.formats.columns import (
+    ARRAYS,
+    PLACES,
+    POSITION,
+    SHOWN_NAMES,
+    Columns,
+    Report,
+    fits_columns,
+    list_names,
+    name_columns,
+    plain_name,
+)
 from spnr_jax.formats.point_tables import MOST_COLUMNS, plain_names
 
 SINGLE = 4  # an array of at most so many numbers does not belong to the points
@@ -46,7 +57,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
             rows = np.atleast_1d(np.lib.format.open_memmap(path, mode="r"))
     except MemoryError:  # the header is nested too deeply for Python's parser
         raise UserError(broken) from None
-    if rows.ndim == 3 and rows.dtype == np.uint8:
+    if rows.ndim > 2 and rows.dtype == np.uint8:
         raise UserError(f"has the shape {rows.shape} and the bytes of a picture; expected points")
     fields = rows.dtype.names
     rows = rows.reshape(-1) if fields else _as_rows(rows, report)
@@ -59,7 +70,7 @@ def numpy_pieces(path: Path, report: Report) -> Iterator[Columns]:
 
 def _as_rows(array: np.ndarray, report: Report) -> np.ndarray:
     """A table (points, c) of a table (points, c) or (c, points), or of point maps (..., h, w, c)."""
-    if array.ndim > 2 and min(array.shape[-3:-1]) > 1:
+    if sum(size > 1 for size in array.shape[:-1]) > 1:
         report(f"an array of {' x '.join(map(str, array.shape))} taken as one cloud; of a batch, save array[0] alone")
     table = array.reshape(-1, array.shape[-1]) if array.ndim > 2 else array
     if table.ndim < 2 or not 3 <= len(table) <= MOST_COLUMNS < table.shape[1]:
@@ -99,7 +110,8 @@ def read_arrays(
     if others := [name for name in sizes if name not in names]:
         report(f"arrays that are not used: {list_names(others)}")
     if not arrays:
-        raise UserError(f"has none of the arrays {list_names([*(wanted or ())])}; found {', '.join(sizes) or 'none'}")
+        expected = list_names([*(wanted or ())][:SHOWN_NAMES])
+        raise UserError(f"has none of the arrays {expected}; found {', '.join(sizes) or 'none'}")
     return arrays
 
 
@@ -112,15 +124,15 @@ def _archive_columns(arrays: dict[str, np.ndarray], report: Report) -> Columns:
         beside = [array for array in unnamed if array.shape in ((len(table), 3), (len(table), 4))]
         table = np.concatenate([table, *beside], axis=1) if name in UNNAMED else table
         columns = dict(zip(plain_names(table, report), table.T, strict=True))
-        wide = {other for other, x in arrays.items() if x.shape[1:] > (SINGLE,) and len(x) != len(table)}
-        others = [
-            other
-            for other, x in arrays.items()
-            if other in POSITION or np.size(x) <= SINGLE < len(table) or other in wide
-        ]
-        if others:
-            report(f"arrays that are not used, which name no column of the {len(table)} points: {list_names(others)}")
-        arrays = {other: x for other, x in arrays.items() if other not in others}
+    count = len(columns["x"]) if name else np.size(arrays.get("x", ()))
+    others = [
+        other
+        for other, x in arrays.items()
+        if (name if other in POSITION else np.size(x) <= SINGLE < count or not fits_columns(x))
+    ]
+    if others:
+        report(f"arrays that are not used, which name no column of the {count} points: {list_names(others)}")
+    arrays = {other: x for other, x in arrays.items() if other not in others}
     columns |= name_columns(arrays)
     if len({len(column) for column in columns.values()}) > 1:
         raise UserError(f"has arrays of different lengths: { {name: len(array) for name, array in columns.items()} }")

@@ -83,8 +83,13 @@ LARGEST_LOGIT = 50  # of splats; above it their opacities are bytes
 NOISE_CLASSES = (7, 18)  # low and high noise (ASPRS LAS 1.4 R15, table 17)
 
 
+def fits_columns(values: np.ndarray) -> bool:
+    """Whether values are numbers (points,) or (points, c), c < 5."""
+    return values.dtype.kind in "fiub" and values.ndim in (1, 2) and values.shape[1:] < (5,)
+
+
 def name_columns(fields: dict[str, np.ndarray]) -> Columns:
-    """Columns (points,) of numeric fields (points,) or (points, c), c < 5; named name:0, name:1 ... as in ParaView.
+    """Columns (points,) of fields that fit; those of several columns are named name:0, name:1 ... as in ParaView.
 
     Of wider fields, and of words, only the name is kept, with a word of what they hold.
     """
@@ -94,7 +99,7 @@ def name_columns(fields: dict[str, np.ndarray]) -> Columns:
         own = name.lower()
         if columns.keys() & {own, f"{own}:0"}:  # of names that differ in letters the first is read
             own = f"{name} (again)"
-        if values.dtype.kind in "fiub" and values.ndim in (1, 2) and width < 5:
+        if fits_columns(values):
             several = {f"{own}:{i}": values[:, i] for i in range(width)} if width > 1 else {}
             columns |= several or {own: values.reshape(-1)}
         else:

@@ -173,7 +173,7 @@ def test_files_of_points_are_read_whatever_stands_around_the_numbers(tmp_path, c
 
 
 def test_arrays_of_pictures_and_of_colours_with_alpha_are_points(tmp_path):
-    for shape in ((20, 21, 3), (5, 4, 21, 3)):
+    for shape in ((20, 21, 3), (5, 4, 21, 3), (20, 21, 1, 3)):
         np.save(tmp_path / "a.npy", BALL.reshape(shape))
         cloud, lines = read(tmp_path / "a.npy")
         np.testing.assert_allclose(cloud.positions, BALL, atol=1e-6)
@@ -267,6 +267,13 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
             "a.npz",
             pack_arrays({"points": BALL, "data": np.zeros((30, 9))}),
             "arrays that are not used, which name no column of the 420 points: data",
+        ),
+        (
+            "a.npz",
+            pack_arrays(
+                dict(zip("xyz", BALL.T, strict=True)) | {"roughness": np.array(0.3), "cd": np.array(9 * ["a"])}
+            ),
+            "arrays that are not used, which name no column of the 420 points: roughness, cd",
         ),
         ("a.csv", "x,y,z,af,s\n" + GREYS, "columns that are not used: af, s"),
         (
