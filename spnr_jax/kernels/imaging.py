@@ -6,7 +6,8 @@ gradients are finite at 0 and below.
 """
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import TypeVar
 
 import jax
@@ -60,6 +61,21 @@ def double_size(x: Float[Array, "batch height width features"]) -> Float[Array, 
         pair = jnp.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], axis + 1)
         x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1 :])
     return x
+
+
+CHECKERBOARD = (-0.0625, 0.25, 0.625, 0.25, -0.0625)  # weights of five pixels; keep 1 - sin(w / 2)^4 of frequency w
+
+
+def remove_checkerboard(x: Float[Array, "batch height width features"]) -> Float[Array, "batch height width features"]:
+    """Without what alternates from pixel to pixel along either axis (Odena et al. 2016); the border repeats."""
+    rows = x.reshape(*x.shape[:2], -1)  # a CPU adds long rows faster
+    for axis, step in (1, 1), (2, x.shape[-1]):
+        size, part = rows.shape[axis], partial(jax.lax.slice_in_dim, axis=axis)
+        border = [part(rows, 0, step)] * 2, [part(rows, size - step, size)] * 2
+        wide = jax.lax.optimization_barrier(jnp.concatenate([*border[0], rows, *border[1]], axis))
+        shifted = (part(wide, i * step, i * step + size) for i in range(len(CHECKERBOARD)))
+        rows = reduce(add, (weight * one for weight, one in zip(CHECKERBOARD, shifted, strict=True)))
+    return rows.reshape(x.shape)
 
 
 def average_pool(x: Float[Array, "*batch height width features"], side: int) -> Float[Array, "*batch h w features"]:

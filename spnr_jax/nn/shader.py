@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb
+from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb, remove_checkerboard
 from spnr_jax.kernels.numerics import (
     clamp,
     dot,
@@ -274,7 +274,8 @@ class Shader(nn.Module):
         double = Double(name="double")
         for _ in range(doublings):
             x = double(x)
-        return nn.Dense(NUM_OUTPUTS, kernel_init=nn.initializers.zeros, name="out")(nn.LayerNorm(name="norm")(x))
+        x = nn.Dense(NUM_OUTPUTS, kernel_init=nn.initializers.zeros, name="out")(nn.LayerNorm(name="norm")(x))
+        return remove_checkerboard(x) if doublings else x
 
 
 def logit(opacity: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
