@@ -64,7 +64,7 @@ def estimate_surfels(cloud: PointCloud, neighbors: Int[Array, "points 20"]) -> S
     def columns(values: AnyArray) -> Array:
         return layers.select(mask, jnp.asarray(values).T, 0)
 
-    normals = None if cloud.normals is None else columns(normalize(jnp.asarray(cloud.normals)))
+    normals = None if cloud.normals is None else normalize(columns(cloud.normals).T).T
     points = PointColumns(
         neighbors=layers.select(mask, jnp.asarray(neighbors).T, -1),
         mask=mask,
