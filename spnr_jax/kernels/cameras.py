@@ -105,10 +105,10 @@ def intersect_box(
 
 
 def orbit(
-    azimuth: float | Float[Array, "*#batch"],
-    elevation: float | Float[Array, "*#batch"],
-    distance: float | Float[Array, "*#batch"],
-    centre: Float[Array, "*#batch 3"],
+    azimuth: float | Float[AnyArray, "*#batch"],
+    elevation: float | Float[AnyArray, "*#batch"],
+    distance: float | Float[AnyArray, "*#batch"],
+    centre: Float[AnyArray, "*#batch 3"],
 ) -> Float[Array, "*#batch 3 4"]:
     """Pose that looks at `centre` from a distance; radians: azimuth around y from +z, elevation above the xz plane.
 
@@ -119,7 +119,7 @@ def orbit(
     direction = jnp.stack([horizontal * east, jnp.sin(elevation), horizontal * south], axis=-1)
     # up where y is along the view
     beside = -jnp.sign(jnp.sin(elevation))[..., None] * jnp.stack([east, jnp.zeros_like(east), south], axis=-1)
-    upright = jnp.stack([jnp.zeros_like(east), jnp.sign(horizontal), jnp.zeros_like(east)], axis=-1)
+    upright = jnp.sign(horizontal)[..., None] * jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), direction.shape)
     up = jnp.where(jnp.abs(horizontal)[..., None] > 1e-6, upright, beside)
     centre = jnp.broadcast_to(centre, direction.shape)
     return look_at(centre + distance[..., None] * direction, centre, up)

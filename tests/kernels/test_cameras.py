@@ -18,6 +18,11 @@ def camera():
     return pinhole(POSES, 0.8, 4, 6)
 
 
+def test_a_pose_has_at_least_32_bits_and_its_centre_may_be_of_numpy():
+    assert cameras.orbit(0.1, 0.2, 3.0, jnp.zeros(3, jnp.bfloat16)).dtype == jnp.float32
+    assert cameras.orbit(np.zeros(2), 0.2, 3.0, np.zeros(3)).shape == (2, 3, 4)
+
+
 class TestRays:
     def test_the_field_of_view_is_the_angle_between_the_left_and_right_border(self):
         rays = np.asarray(jax.jit(lambda pose: camera_rays(pinhole(pose, 0.8, 1, 1000)).directions[0])(POSES[0, 0]))
