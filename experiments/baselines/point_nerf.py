@@ -36,7 +36,7 @@ from spnr_jax.kernels import cameras, compositing, losses, sampling
 from spnr_jax.kernels.imaging import WHITE
 from spnr_jax.kernels.metrics import psnr
 from spnr_jax.kernels.numerics import length, per_feature
-from spnr_jax.kernels.records import Batch, Camera, Key, PointCloud, Rays, Rendering, record
+from spnr_jax.kernels.records import Batch, Camera, Key, PointCloud, Rays, Record, Rendering
 from spnr_jax.kernels.voxels import map_existing
 from spnr_jax.method.inference import opacity_loss
 from spnr_jax.methods import Outcome
@@ -131,16 +131,14 @@ def point_nerf_tiny() -> TrainConfig:
     )
 
 
-@record
-class ViewRays:
+class ViewRays(Record):
     """Rays, and for each the axes of its camera as columns: offsets are seen from the world and from the camera."""
 
     rays: Rays
     axes: Float[Array, "*batch 3 3"]
 
 
-@record
-class ShadingPoints:
+class ShadingPoints(Record):
     """Where a ray is shaded; a ray with fewer than its share has them first, and the rest do not exist."""
 
     distances: Float[Array, "*batch samples"]

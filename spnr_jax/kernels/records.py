@@ -6,7 +6,7 @@ sizes are static fields because they shape arrays.
 """
 
 import contextlib
-from typing import Any, dataclass_transform, no_type_check
+from typing import TYPE_CHECKING, Any, Self, dataclass_transform, no_type_check
 
 import jax
 import numpy as np
@@ -37,18 +37,23 @@ def register(kind: type) -> None:
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
-def record(kind: type) -> Any:
+class Record:
     """A frozen dataclass that is a pytree, and whose functions `jax.export` can serialise.
 
     Its fields are not checked at run time: transformations rebuild records with leaves that are no arrays.
     """
-    made = no_type_check(struct.dataclass(kind))
-    register(made)
-    return made
+
+    def __init_subclass__(cls) -> None:
+        register(no_type_check(struct.dataclass(cls)))
+
+    if TYPE_CHECKING:
+
+        def replace(self, **changes: Any) -> Self:
+            """A copy with other values of these fields; Flax makes it."""
+            ...
 
 
-@record
-class PointCloud:
+class PointCloud(Record):
     """Surface points of one object with their materials, padded to a fixed count; `mask` is True for real points."""
 
     positions: Float[AnyArray, "*batch points 3"]
@@ -72,8 +77,7 @@ class PointCloud:
     """
 
 
-@record
-class Camera:
+class Camera(Record):
     """A pinhole camera: pose with OpenGL axes (x right, y up, looking along -z) and intrinsics in pixels.
 
     `height` and `width` are static, because they shape arrays.
@@ -85,16 +89,14 @@ class Camera:
     width: int = struct.field(pytree_node=False)
 
 
-@record
-class Rays:
+class Rays(Record):
     """Half lines; `directions` have unit length, so distances along them are metric."""
 
     origins: Float[Array, "*batch 3"]
     directions: Float[Array, "*batch 3"]
 
 
-@record
-class Rendering:
+class Rendering(Record):
     """The result of a rendering; of a network with an upsampler, all but `image` has the resolution before it.
 
     `depth` is the expected distance along the ray (where nothing is hit: the far side of the box, or 0 beside it),
@@ -110,16 +112,14 @@ class Rendering:
     """Number of entries, pixels, columns and rows that did not fit into a surfel plan; 0: everything is drawn."""
 
 
-@record
-class Scene:
+class Scene(Record):
     """An encoded object of a ray-marching network: the feature volume, and which of its voxels hold points."""
 
     volume: Float[Array, "*batch d d d features"]
     occupied: Bool[Array, "*batch d d d"]
 
 
-@record
-class Volume:
+class Volume(Record):
     """An object as a Linen network encodes it, in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.
 
     `scene` is the network's encoding: a `Scene` for the paper's network.
@@ -132,8 +132,7 @@ class Volume:
     """Voxels around points within which rays are sampled; follows from the point spacing."""
 
 
-@record
-class Surfels:
+class Surfels(Record):
     """Surface elements of one object (`surfels/geometry.py`): discs with materials.
 
     Lengths are in units of the box, colours linear.  Where `mask` is False, the spacing is 1 and all else 0.
@@ -167,8 +166,7 @@ class Surfels:
     mask: Bool[AnyArray, "*batch points"]
 
 
-@record
-class SurfelScene:
+class SurfelScene(Record):
     """An encoded object of the surfel network; arrays only, so scenes of equally padded clouds can be stacked.
 
     The surfels lie in the box [-1, 1]^3, which is (position - centre) * scale of the cloud.  `spacing` is their median
@@ -184,8 +182,7 @@ class SurfelScene:
 Encoded = Volume | SurfelScene  # what Model.encode returns: a scene for surfels, a volume for other networks
 
 
-@record
-class Light:
+class Light(Record):
     """Distant light as tables by direction, all linear in the environment map (`surfels/lighting.py`).
 
     `tables[0]` is the irradiance / pi by normal.  `tables[1:]` are the prefiltered radiances by mirrored direction, one
@@ -230,8 +227,7 @@ class Light:
         return Light(tables=(1 - part) * near + part * far)
 
 
-@record
-class GBuffer:
+class GBuffer(Record):
     """The attributes of the front-most surfels at each pixel, blended; vectors are in camera axes, 0 without discs.
 
     Entry i of a pixel has the kernel k_i, the facing f_i, the transmittance T_i in front of it, the blend weight a_i
@@ -258,8 +254,7 @@ class GBuffer:
     """Mean, by b_i, of the offset of the discs' centres from the pixel's centre, in pixels."""
 
 
-@record
-class Batch:
+class Batch(Record):
     """One training batch: clouds of `objects`, and `views` of each with reference, opacity, and condition image."""
 
     cloud: PointCloud
@@ -270,8 +265,7 @@ class Batch:
     condition_mask: Bool[AnyArray, "objects views height width"]
 
 
-@record
-class Crops:
+class Crops(Record):
     """One training batch of the shader network: crops of G-buffers as network inputs (`nn/shader.py`).
 
     `target` is the reference, 8-bit RGBA with straight alpha, at 2^doublings times the resolution.  `inputs` extend
@@ -286,8 +280,7 @@ class Crops:
     margin: int = struct.field(pytree_node=False, default=0)
 
 
-@record
-class Gaussians:
+class Gaussians(Record):
     """Gaussian splats of one object, as `spnr_jax/surfels/gaussians.py` makes them and splat viewers draw them.
 
     Splat i is its opacity times exp(-d^T C^-1 d / 2), with C = R S^2 R^T from its rotation (a unit quaternion, w x y z)

@@ -29,7 +29,7 @@ from spnr_jax.devices.programs import object_groups
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import sampling
 from spnr_jax.kernels.numerics import clamp
-from spnr_jax.kernels.records import Rays, record
+from spnr_jax.kernels.records import Rays, Record
 
 NEIGHBORS = tuple((z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1))
 
@@ -289,8 +289,7 @@ def find_corners(
 # --- empty space ------------------------------------------------------------------------------------------------------
 
 
-@record
-class RayPath:
+class RayPath(Record):
     """Cells along rays: their sorted `edges`, distances along the ray, and the open length up to each edge."""
 
     edges: Float[Array, "*batch cells+1"]

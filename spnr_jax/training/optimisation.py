@@ -20,14 +20,13 @@ from jaxtyping import Array, Float
 from spnr_jax.config import TrainConfig
 from spnr_jax.errors import UserError
 from spnr_jax.kernels import losses
-from spnr_jax.kernels.records import AnyArray, Batch, Key, record
+from spnr_jax.kernels.records import AnyArray, Batch, Key, Record
 from spnr_jax.methods import method_of
 
 DiscriminatorState = tuple[dict, tuple]  # parameters and optimiser state of the discriminator
 
 
-@record
-class TrainState:
+class TrainState(Record):
     """Everything that a step changes; data only.  `averaged` holds the moving averages that evaluation uses."""
 
     step: Array
