@@ -63,7 +63,7 @@ def double_size(x: Float[Array, "batch height width features"]) -> Float[Array, 
     return x
 
 
-CHECKERBOARD = (-0.0625, 0.25, 0.625, 0.25, -0.0625)  # weights of five pixels; keep 1 - sin(w / 2)^4 of frequency w
+NOTCH = np.array([-1, 8, -28, 56, 186, 56, -28, 8, -1]) / 256  # weights; 1 - sin(w / 2)^8 of a frequency w is kept
 
 
 def remove_checkerboard(x: Float[Array, "batch height width features"]) -> Float[Array, "batch height width features"]:
@@ -71,10 +71,10 @@ def remove_checkerboard(x: Float[Array, "batch height width features"]) -> Float
     rows = x.reshape(*x.shape[:2], -1)  # a CPU adds long rows faster
     for axis, step in (1, 1), (2, x.shape[-1]):
         size, part = rows.shape[axis], partial(jax.lax.slice_in_dim, axis=axis)
-        border = [part(rows, 0, step)] * 2, [part(rows, size - step, size)] * 2
-        wide = jax.lax.optimization_barrier(jnp.concatenate([*border[0], rows, *border[1]], axis))
-        shifted = (part(wide, i * step, i * step + size) for i in range(len(CHECKERBOARD)))
-        rows = reduce(add, (weight * one for weight, one in zip(CHECKERBOARD, shifted, strict=True)))
+        first, last = ([part(rows, *border)] * (len(NOTCH) // 2) for border in ((0, step), (size - step, size)))
+        wide = jax.lax.optimization_barrier(jnp.concatenate([*first, rows, *last], axis))
+        shifted = (part(wide, i * step, i * step + size) for i in range(len(NOTCH)))
+        rows = reduce(add, (float(weight) * one for weight, one in zip(NOTCH, shifted, strict=True)))
     return rows.reshape(x.shape)
 
 
