@@ -325,9 +325,9 @@ def linear_colors(channels: np.ndarray, name: str, *, linear: bool = False) -> t
         return np.zeros(channels.shape), []
     strays = max(1, len(channels) // STRAYS) if len(channels) >= LEAST else 0
     highest = np.partition(channels.max(axis=-1), -1 - strays)[-1 - strays]
-    linear_floats = linear and not (highest > LARGEST_FLOAT and not (channels % 1).any())
+    whole = linear and highest > LARGEST_FLOAT and not (channels % 1).any()
     percent = not linear and channels.dtype.kind == "f" and 2 < highest <= 100 and (channels[:LEAST] % 1).any()
-    white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear_floats)
+    white = 100.0 if percent else full_scale(channels.dtype, float(highest), linear and not whole)
     low, high = np.partition(channels.min(axis=-1), strays)[strays] / white, highest / white
     if not (low >= -ROUNDING and high <= 1 + max(ROUNDING, 1.5 / 255 if white == 255 else 0)):
         others = "; sRGB colours are named red green blue" if linear else " or 0 to 255"

@@ -93,3 +93,18 @@ def test_a_pixel_in_a_dent_lies_behind_the_mean_around_it_and_one_on_a_bump_befo
         assert seen[8, 8, column] > 0.3
         assert seen[24, 24, column] < -0.3
         close(seen[16, 16, column], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("doublings", [1, 2])
+def test_the_pixels_that_the_network_makes_of_one_do_not_alternate(doublings):
+    network, inputs = shader.Shader((4,), 4), jnp.full((1, 32, 32, shader.NUM_FEATURES), 0.5)
+    shapes = jax.eval_shape(lambda: network.init(jax.random.key(0), inputs, doublings))
+    noise = np.random.default_rng(0)
+    weights = jax.tree.map(lambda x: jnp.asarray(noise.normal(size=x.shape), jnp.float32), shapes)
+    far = 16 * 2**doublings  # from the border, where all pixels have equal neighbors
+    square = np.asarray(network.apply(weights, inputs, doublings))[0, far - 8 : far + 8, far - 8 : far + 8]
+    signs = (-1.0) ** np.arange(16)
+    scale = np.abs(square).max()
+    assert scale > 0.1
+    np.testing.assert_allclose(np.einsum("hwc,h->wc", square, signs) / 16, 0, atol=1e-4 * scale)
+    np.testing.assert_allclose(np.einsum("hwc,w->hc", square, signs) / 16, 0, atol=1e-4 * scale)
