@@ -88,7 +88,7 @@ def open_dataset(folder: Path | str) -> Dataset:
     for split in ("train", "val", "test"):
         path = folder / "splits" / f"{split}.txt"
         if not path.is_file():
-            raise UserError(f"{path}: missing; run `spnr-data generate {folder}` again, it completes the data set")
+            raise UserError(f"{path}: missing; repeat the `spnr-data generate` command that began it")
         splits[split] = tuple(path.read_text(errors="replace").split())
         if strange := [name for name in splits[split] if not is_plain_name(name)]:
             raise UserError(f"{path}: {strange[0]!r} is no name of an object; generate the data set again")
@@ -106,9 +106,10 @@ def checksum(dataset: Dataset, *splits: str) -> str:
 
 
 def read_record(dataset: Dataset, name: str) -> bytes:
-    """The content of an object's object.json, with the checksums of its files; empty if it is missing."""
-    path = dataset.folder / "objects" / name / "object.json"
-    return path.read_bytes() if path.is_file() else b""
+    """The content of an object's object.json, with the checksums of its files; the files' own if it is missing."""
+    folder = dataset.folder / "objects" / name
+    files = [folder / "object.json"] if (folder / "object.json").is_file() else sorted(folder.rglob("*"))
+    return b"".join(file.read_bytes() for file in files if file.is_file())
 
 
 def is_plain_name(name: str) -> bool:

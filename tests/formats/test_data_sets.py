@@ -90,7 +90,7 @@ def test_images_of_another_size_than_the_presets_are_refused_with_both_sizes(tmp
         ("dataset.json", "{", "not valid JSON"),
         ("dataset.json", "[" * 100_000 + "]" * 100_000, "not valid JSON"),
         ("dataset.json", "3", "no settings"),
-        ("splits/val.txt", None, "val.txt: missing; run `spnr-data generate"),
+        ("splits/val.txt", None, "val.txt: missing; repeat the `spnr-data generate` command"),
         ("splits/train.txt", "../../secret", "no name of an object"),
         ("splits/train.txt", ".", "no name of an object"),
     ],
@@ -99,6 +99,17 @@ def test_a_data_set_that_is_unfinished_or_whose_lists_lead_elsewhere_is_refused(
     (copy / file).unlink() if content is None else (copy / file).write_text(content)
     with pytest.raises(ValueError, match=reason):
         data_sets.open_dataset(copy)
+
+
+@pytest.mark.parametrize("file", ["points.ply", "images/001.png", "object.json"])
+def test_the_record_of_an_object_changes_with_its_files_also_without_object_json(file, copy):
+    dataset, folder = data_sets.open_dataset(copy), copy / "objects" / NAMES[0]
+    (folder / "object.json").unlink(missing_ok=True)  # as in data made by hand
+    before = data_sets.read_record(dataset, NAMES[0])
+    assert data_sets.read_record(dataset, NAMES[0]) == before
+    (folder / file).write_bytes(b"another")
+    assert data_sets.read_record(dataset, NAMES[0]) != before
+    assert data_sets.read_record(dataset, "none") == b""
 
 
 def test_a_picture_that_announces_billions_of_pixels_is_refused_before_memory_is_taken(copy):
