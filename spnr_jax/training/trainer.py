@@ -34,7 +34,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
-from spnr_jax.training.weights import Trained, add_companions, write_weights
+from spnr_jax.training.weights import Trained, add_companions, keep_companions, write_weights
 
 PREVIEWED = 6  # objects of a preview
 NETWORK = "weights.npz"  # of a finished run
@@ -120,7 +120,10 @@ def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Tra
     """The state to continue from (the newest checkpoint, or before the first step), and a message about it."""
     with programs.use_mesh(mesh):
         sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec())  # every device holds it whole
-        state = checkpoint.restore(run, config, tqdm.write, sharding) or new_state(config, init)
+        if (state := checkpoint.restore(run, config, tqdm.write, sharding)) is None:
+            state = new_state(config, init)
+            if init is not None:
+                keep_companions(run, init)
         # as restored states are: else the step would be compiled once more for a run that goes on
         state = jax.device_put(state, sharding or jax.local_devices()[0])
     if (step := int(state.step)) >= config.num_steps:

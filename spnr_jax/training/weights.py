@@ -59,6 +59,14 @@ def own_companions(config: NetworkConfig, source: Path) -> dict[str, Path]:
     return {name: path for name, path in files.items() if path.is_file()}
 
 
+def keep_companions(run: Path, trained: Trained) -> None:
+    """Writes the network's companions to a run folder, which trains with them; a file that is there stays."""
+    for name in method_of(trained.config.model).companions:
+        if not (path := run / f"{name}.npz").exists():
+            weights = flatten_dict(trained.variables[name], sep="/")
+            write_whole(path, pack_arrays({x: np.asarray(w, np.float16) for x, w in weights.items()}, compressed=True))
+
+
 def locate(source: Path | str | None) -> Path:
     """The run folder or file that `read_trained` reads."""
     return packaged_file() if source is None or str(source) == PACKAGED else Path(source)
