@@ -14,7 +14,6 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -121,7 +120,7 @@ class UnknownMethod(UserError):
     """A file names a method that is not registered."""
 
 
-_included: dict[str, Path | str] = {}  # module or file that `include` imported -> its location
+_included: set[Path | str] = set()  # modules and files that `include` imported
 
 
 def register(method: Method) -> None:
@@ -140,14 +139,16 @@ def include(source: Path | str) -> None:
     """Imports a module or a .py file that registers methods; a one-line ValueError if that fails."""
     name = str(source)
     location = Path(name).resolve() if name.endswith(".py") else name
-    if location in _included.values():
+    if location in _included:
         return
-    before = set(METHODS)
+    before, folder = set(METHODS), str(Path.cwd())
+    sys.path.insert(0, folder)  # its modules can be imported, as `python` has it and an installed command has not
     try:
-        with _working_folder():
-            _import_file(location) if isinstance(location, Path) else importlib.import_module(location)
+        _import_file(location) if isinstance(location, Path) else importlib.import_module(location)
     except Exception as error:  # whatever a person's module raises
         raise UserError(f"--methods {name}: it cannot be imported ({first_line(error)})") from error
+    finally:
+        sys.path.remove(folder)
     registered = METHODS.keys() - before
     known = any(m.source.startswith(name) for m in METHODS.values())
     require(
@@ -155,17 +156,7 @@ def include(source: Path | str) -> None:
     )
     for method in registered:
         METHODS[method] = dataclasses.replace(METHODS[method], source=name)
-    _included[name] = location
-
-
-@contextmanager
-def _working_folder():
-    """Makes modules of the working folder importable, as `python` does and an installed command does not."""
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        yield
-    finally:
-        sys.path.remove(str(Path.cwd()))
+    _included.add(location)
 
 
 def _import_file(path: Path) -> None:

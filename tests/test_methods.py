@@ -24,7 +24,7 @@ SOURCE = re.search(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
 
 def forget(patch: pytest.MonkeyPatch) -> None:
     """What was registered before, and nothing of this file's."""
-    patch.setattr(methods, "_included", dict(methods._included))
+    patch.setattr(methods, "_included", set(methods._included))
     for registry in (methods.METHODS, PRESETS):
         patch.setitem(registry, "mean_color", None)  # is put back as it was: absent
         del registry["mean_color"]
