@@ -21,6 +21,7 @@ from spnr_jax.surfels import lighting, skies
 WHITE_SPHERE_RADIANCE = 0.6  # far enough below 1 that white objects keep their shading against the white background
 
 DRAWN_HEIGHT = 256  # rows of a map that a view draws
+MOST_LAMPS = 4  # of a random map
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,26 @@ class Lights:
         for view in range(count):
             generator = np.random.default_rng((seed, view, DRAWN_HEIGHT))
             maps = self.kinds[generator.integers(len(self.kinds))]
-            drawn = maps[generator.integers(len(maps))] if maps else skies.random_map(generator, DRAWN_HEIGHT)
+            drawn = maps[generator.integers(len(maps))] if maps else random_map(generator)
             turned = np.roll(drawn, generator.integers(drawn.shape[1]), axis=1)
             yield scale_to_white(turned)
+
+
+def random_map(generator: np.random.Generator) -> np.ndarray:
+    """A sky of random colours with up to MOST_LAMPS lamps, from broad glows to suns of three degrees."""
+
+    def random_color(brightness: float, tint: float) -> np.ndarray:
+        return brightness * np.exp(tint * generator.standard_normal(3))
+
+    above, around, below = (random_color(brightness, 0.3) for brightness in np.exp(generator.normal(-1, 0.7, 3)))
+    whole = skies.gradient(above, around, below, DRAWN_HEIGHT)
+    for _ in range(generator.integers(0, MOST_LAMPS + 1)):
+        rise = np.degrees(np.arcsin(generator.uniform(-0.4, 1)))
+        size = np.exp(generator.uniform(np.log(3), np.log(90)))
+        power = np.exp(generator.normal(-0.3, 0.7))
+        turn = generator.uniform(0, 360)
+        whole = whole + skies.lamp(turn, rise, size, random_color(power, 0.2), DRAWN_HEIGHT)
+    return np.asarray(whole)
 
 
 def read_kinds(names: Sequence[str]) -> tuple[tuple[np.ndarray, ...], ...]:

@@ -1,4 +1,4 @@
-"""Computed environment maps: skies, studios, lamps, random maps for training, and the package's room.
+"""Computed environment maps: skies, studios, lamps, and the package's room.
 
 Maps are as in `lighting.py`.  They add and scale; none is normalised.
 
@@ -107,7 +107,6 @@ def soft_box(positions: np.ndarray, centre, half, softness: float) -> np.ndarray
 HEIGHT = 128
 HORIZON = 0.08  # sine of the elevation over which ground and sky blend
 MIDDLE = 1 - 1e-7  # cosine of the angle from a lamp's centre, at most
-MOST_LAMPS = 4  # of a random map
 
 Angle = float | int | np.floating | jax.Array  # degrees
 Map = Float[AnyArray, "height width 3"]
@@ -183,22 +182,6 @@ NAMED: dict[str, Callable[[int], Map]] = {
     "overcast": overcast,
     "night": night,
 }
-
-
-def random_map(generator: np.random.Generator, height: int = HEIGHT) -> Map:
-    """A sky of random colours with up to MOST_LAMPS lamps, from broad glows to suns of three degrees."""
-
-    def random_color(brightness: float, tint: float) -> np.ndarray:
-        return brightness * np.exp(tint * generator.standard_normal(3))
-
-    above, around, below = np.exp(generator.normal(-1, 0.7, 3))
-    whole = gradient(random_color(above, 0.3), random_color(around, 0.3), random_color(below, 0.3), height)
-    for _ in range(generator.integers(0, MOST_LAMPS + 1)):
-        rise = np.degrees(np.arcsin(generator.uniform(-0.4, 1)))
-        size = np.exp(generator.uniform(np.log(3), np.log(90)))
-        power = np.exp(generator.normal(-0.3, 0.7))
-        whole = whole + lamp(generator.uniform(0, 360), rise, size, random_color(power, 0.2), height)
-    return whole
 
 
 def normalise(envmap: Map, white: float | int = 0.6) -> Map:

@@ -38,3 +38,10 @@ def test_light_from_a_direction_of_the_map_falls_on_that_side_of_an_object(axis,
     lit = views.render_view(scene, views.look_at(3 * towards + 0.01), config, 0)
     dark = views.render_view(scene, views.look_at(-3 * towards + 0.01), config, 0)
     assert lit[..., :3].mean() > 10 * dark[..., :3].mean()
+
+
+def test_random_maps_follow_from_their_generator_and_differ():
+    maps = [light.random_map(np.random.default_rng(seed)) for seed in (0, 0, 1, 2, 3)]
+    np.testing.assert_array_equal(maps[0], maps[1])
+    assert all(np.isfinite(x).all() and x.min() >= 0 and x.max() > 0 for x in maps)
+    assert len({x.tobytes() for x in maps}) == 4
