@@ -233,10 +233,10 @@ def r1(image, kernel):
     return losses.r1(lambda x: 0.5 * jnp.einsum("bhwc,hwc->b", x, kernel, precision="highest") ** 2, image)
 
 
-def images(rng, size, apart=1.0):
+def images(rng, size):
     """Two images of that size, nowhere equal."""
     image = rng.normal(size=(16, 16, 3))
-    return size * image, size * (image + apart * rng.uniform(0.1, 1, image.shape))
+    return size * image, size * (image + rng.uniform(0.1, 1, image.shape))
 
 
 def off_grey(rng, value):

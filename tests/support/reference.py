@@ -14,15 +14,15 @@ def camera_ray(cam_to_world, focal, centre, row, column):
     return direction / math.sqrt(direction @ direction)
 
 
-def box_interval(origin, direction, lo=-1.0, hi=1.0):
-    """(near, far) of the part of the ray at positive distance inside [lo, hi]^3, None where it misses."""
+def box_interval(origin, direction):
+    """(near, far) of the part of the ray at positive distance inside [-1, 1]^3, None where it misses."""
     near, far = 0.0, math.inf
     for o, d in zip(np.float64(origin), np.float64(direction), strict=True):
         if d == 0:
-            if not lo <= o <= hi:
+            if abs(o) > 1:
                 return None
             continue
-        first, second = sorted(((lo - o) / d, (hi - o) / d))
+        first, second = sorted(((-1 - o) / d, (1 - o) / d))
         near, far = max(near, first), min(far, second)
     return (near, far) if far > near else None
 
@@ -111,13 +111,13 @@ def area_downsample(image, size):
     return out
 
 
-def group_norm(x, groups, epsilon=1e-5):
+def group_norm(x, groups):
     """One array (*space, features), each group of consecutive channels to zero mean and unit variance."""
     x, width = np.float64(x), x.shape[-1] // groups
     out = np.empty_like(x)
     for g in range(groups):
         part = x[..., g * width : (g + 1) * width]
-        out[..., g * width : (g + 1) * width] = (part - part.mean()) / math.sqrt(part.var() + epsilon)
+        out[..., g * width : (g + 1) * width] = (part - part.mean()) / math.sqrt(part.var() + 1e-5)
     return out
 
 
@@ -126,11 +126,11 @@ def softplus(x):
     return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(np.float64(x))))
 
 
-def batch_norm(x, epsilon=1e-5):
+def batch_norm(x):
     """(normalised rows, mean, variance) of real points (n, features); a mean of 0 and no variance without points."""
     x = np.float64(x)
     mean, variance = (x.mean(axis=0), x.var(axis=0)) if len(x) else (np.zeros(x.shape[1]), np.zeros(x.shape[1]))
-    return (x - mean) / np.sqrt(variance + epsilon), mean, variance
+    return (x - mean) / np.sqrt(variance + 1e-5), mean, variance
 
 
 def shares(tau, depth, spacing, near):
