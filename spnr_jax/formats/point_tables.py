@@ -9,7 +9,7 @@ Without a header the values decide what follows x y z: normals, r g b, alpha, ro
 import contextlib
 import re
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -17,14 +17,7 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 from spnr_jax.errors import UserError
-from spnr_jax.formats.columns import (
-    NORMAL,
-    POSITION,
-    Columns,
-    Report,
-    list_names,
-    name_places,
-)
+from spnr_jax.formats.columns import NORMAL, POSITION, Columns, Report, list_names, name_places
 
 Line = tuple[int, str]  # line number in the file, from 1, and text
 
@@ -95,20 +88,30 @@ def text_pieces(path: Path, report: Report) -> Iterator[Columns]:
                 if {names[i] for i in words} & {*POSITION, *COLOR}:
                     raise broken
                 names = _name_words(names, table, words)
-                _report_cut_numbers(names, table, report)
+                if cut := [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]:
+                    numbers = "whole numbers among small ones of three decimals"
+                    report(f"{numbers} in {', '.join(cut)}: write thousands without marks")
             yield {name: column for name, column in zip(names, table.T, strict=True) if name != INDEX}
         _report_counts(counted, report)
 
 
 def _read_head(lines: Iterator[Line]) -> Head:
     """What stands above the numbers, and the first row of them; UserError if there is none."""
-    before, first = _split_header(lines)
-    if not first[1]:
-        remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
-        wanted = "expected rows of numbers, with a line of names above them if they begin with words"
-        raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
-    delimiter = _find_delimiter(before, first[1])
-    return Head(before, first, delimiter, [field.replace(",", ".") for field in first[1].split(delimiter)])
+    before: deque[str] = deque(maxlen=MOST_LINES)
+    for number, line in lines:
+        words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
+        numbered = words == list(map(str, range(len(words))))  # pandas' names of unnamed columns
+        fields, above = ([*map(_is_number, _words(text))] for text in (line[:LONGEST_HEADER], ["", *before][-1]))
+        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # the row may begin with a word
+        if (NUMBER.fullmatch(words[0]) or below_names) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
+            delimiter = _find_delimiter(before, line)
+            fields_of_first = [field.replace(",", ".") for field in line.split(delimiter)]
+            return Head([*before], (number, line), delimiter, fields_of_first)
+        if any(map(str.isalnum, line)):  # else a line of marks alone
+            before.append(line[:LONGEST_HEADER])
+    remark = next((text for line in reversed(before) if (text := line.lstrip("#/% "))), "")
+    wanted = "expected rows of numbers, with a line of names above them if they begin with words"
+    raise UserError(f"holds 0 points: {wanted}; found {remark[:SHOWN]!r}")
 
 
 def _rows_of_numbers(head: Head, lines: Iterator[Line], counted: Counter[str]) -> Iterator[Line]:
@@ -141,13 +144,6 @@ def _name_words(names: tuple[str, ...], table: np.ndarray, words: Collection[int
     return tuple(of_words.get(i, name) if name != INDEX else name for i, name in enumerate(names))
 
 
-def _report_cut_numbers(names: Sequence[str], table: np.ndarray, report: Report) -> None:
-    """Reports positions that look as if marks of thousands were taken for decimal ones: 1.987 among 705 and 12."""
-    if cut := [name for name, x in zip(names, table.T, strict=True) if name in POSITION and _are_cut(x)]:
-        numbers = "whole numbers among small ones of three decimals"
-        report(f"{numbers} in {', '.join(cut)}: write thousands without marks")
-
-
 def _report_counts(counted: Counter[str], report: Report) -> None:
     """Reports rows that are missing or not read."""
     points, announced = counted["points"], counted["announced"]
@@ -158,7 +154,7 @@ def _report_counts(counted: Counter[str], report: Report) -> None:
         report(f"{counted['commented']:,} rows that begin with a mark of remarks (# // %) are not read")
 
 
-def _find_delimiter(before: list[str], row: str) -> str | None:
+def _find_delimiter(before: Iterable[str], row: str) -> str | None:
     """What separates the numbers of a row: tabs if the line of names has as many; None for blanks."""
     if row.count("\t") in {line.count("\t") for line in before} - {0, 1}:
         return "\t"
@@ -236,21 +232,6 @@ def _packed_color(word: str) -> float:
 
 def _is_number(word: str) -> bool:
     return not (word := word.strip()) or any(form.fullmatch(word) for form in (NUMBER, UNDEFINED, WITH_COMMA))
-
-
-def _split_header(lines: Iterator[Line]) -> tuple[list[str], Line]:
-    """The last lines above the rows of numbers, and the first row ((0, "") if there is none)."""
-    before: deque[str] = deque(maxlen=MOST_LINES)
-    for number, line in lines:
-        words = re.split(r"[\s;,]+", line[:LONGEST_HEADER])
-        numbered = words == list(map(str, range(len(words))))  # pandas' names of unnamed columns
-        fields, above = ([*map(_is_number, _words(text))] for text in (line[:LONGEST_HEADER], ["", *before][-1]))
-        below_names = len(fields) == len(above) and not any(above) and sum(fields) >= 3  # the row may begin with a word
-        if (NUMBER.fullmatch(words[0]) or below_names) and not (COUNT.fullmatch(line[:SHOWN]) or numbered):
-            return [*before], (number, line)
-        if any(map(str.isalnum, line)):  # else a line of marks alone
-            before.append(line[:LONGEST_HEADER])
-    return [*before], (0, "")
 
 
 def load_text(rows: Sequence[Line], what: str, count: int, delimiter: str | None = None, **layout: Any) -> np.ndarray:
