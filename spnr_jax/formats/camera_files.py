@@ -59,10 +59,7 @@ def read_document(path: str | Path, report: Callable[[str], None] = lambda line:
 
 
 def cameras_of(
-    document: Mapping[str, Any],
-    rotation: np.ndarray | None = None,
-    origin: np.ndarray | None = None,
-    size: int = SIZE,
+    document: Mapping[str, Any], rotation: np.ndarray | None = None, origin: np.ndarray | None = None, size: int = SIZE
 ) -> list[Camera]:
     """The cameras of a file's content, float32; KeyError for a missing entry, Type- or ValueError for a wrong one."""
     turn, place = np.eye(3) if rotation is None else rotation, np.zeros(3) if origin is None else origin

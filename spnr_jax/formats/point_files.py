@@ -52,6 +52,7 @@ TEXTS = (
 )
 BLENDER = "convert it to .glb, e.g. with Blender (File > Import, then File > Export > glTF 2.0)"
 CLOUDCOMPARE = "convert it to .las or .ply, e.g. with CloudCompare (File > Save)"
+PARAVIEW = "convert it to .ply, e.g. with ParaView"
 ARRAYS = "save its points in Python with np.savez(file, points=..., colors=...)"
 REAL = rb"[-+.\deE]+[ \t]*"
 # columns and rows of the scan, four rows of three numbers, then of four
@@ -75,12 +76,7 @@ FOREIGN = (
     ("a ROS bag", ".bag .mcap .db3", rb"#ROSBAG V([\d.]+)|\x89MCAP", "save a topic as .pcd with `pcl_ros bag_to_pcd`"),
     ("PTX", "", PTX_HEAD, CLOUDCOMPARE),
     ("CloudCompare's own", "", rb"CCB2", CLOUDCOMPARE),
-    (
-        "VTK",
-        ".vtk .vtp .vtu",
-        rb"# vtk DataFile Version ([\d.]+)|<\?xml.{,99}<VTKFile",
-        "convert it to .ply, e.g. with ParaView",
-    ),
+    ("VTK", ".vtk .vtp .vtu", rb"# vtk DataFile Version ([\d.]+)|<\?xml.{,99}<VTKFile", PARAVIEW),
     ("COLMAP's points", "", rb"# 3D point list", "convert it to .ply with `colmap model_converter --output_type PLY`"),
     ("Draco", ".drc", rb"DRACO(.)(.)", "convert it to .ply with `draco_decoder -i a.drc -o a.ply`"),
     ("", ".splat .ksplat .sog", b"", "convert it to .ply with SuperSplat"),
