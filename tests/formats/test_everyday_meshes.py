@@ -56,16 +56,21 @@ def by_corner(text: str, *values) -> str:
     return "".join(map("".join, zip(text.split("?"), [*map(str, values), ""], strict=True)))
 
 
+def of_faces(text: str, properties: str, one: str, other: str) -> str:
+    """A PLY file of `square_ply` whose two faces have further properties."""
+    text = text.replace("end_header", properties)
+    return text.replace("3 0 1 2", f"3 0 1 2 {one}").replace("3 0 2 3", f"3 0 2 3 {other}")
+
+
 TWO, TWO_OF_OBJ = "3 0 1 2\n3 0 2 3\n", "f 1 2 3\nf 1 3 4\n"
 FACES_RGBA = "".join(f"property uchar {name}\n" for name in (*RGB, "alpha")) + "end_header"
-PAINTED = square_ply("uchar", RGB, GREEN).replace("3 0 1 2", "3 0 1 2 9 9 9 0").replace("3 0 2 3", "3 0 2 3 9 8 9 255")
 HIDDEN = {  # a square of which the first triangle is transparent
     "COFF": ("a.off", "COFF\n4 2 0\n" + by_corner("".join(f"{c} 1 1 1 ?\n" for c in CORNERS), 0, 0, 0, 1) + TWO),
     "OBJ": ("a.obj", by_corner("".join(f"v {c} 1 1 1 ?\n" for c in CORNERS), 0, 0, 0, 1) + TWO_OF_OBJ),
     "opacity": ("a.ply", by_corner(square_ply("float", ["opacity"], "?"), 0, 0, 0, 1)),
     "rgba": ("a.ply", by_corner(square_ply("uint", ["rgba"], "?"), 1, 1, 1, 2**32 - 1)),
     "faces of OFF": ("a.off", "OFF\n4 2 0\n" + "\n".join(CORNERS) + "\n3 0 1 2 9 9 9 0\n3 0 2 3 9 9 9 255\n"),
-    "faces of PLY": ("a.ply", PAINTED.replace("end_header", FACES_RGBA)),
+    "faces of PLY": ("a.ply", of_faces(square_ply("uchar", RGB, GREEN), FACES_RGBA, "9 9 9 0", "9 8 9 255")),
 }
 
 
@@ -79,35 +84,23 @@ def test_faces_that_are_transparent_are_left_out_and_counted(tmp_path, case):
         assert not any("alpha" in line for line in read(write(tmp_path, "a.off", invisible))[1])
 
 
-SEVERAL = by_corner("".join(f"v {c} ?\n" for c in CORNERS), 1, 1, 2, 1) + TWO_OF_OBJ
 BOTH = by_corner(square_ply("uchar", ["r", "g", "b"], ("?", 0, 0)), 1, 2, 3, 4)
-FLAGS = "property int flags\nproperty float quality\nend_header"
+FLAGS, LASER = "property int flags\nproperty float quality\nend_header", ("classification", "withheld")
 UNUSED = {
-    "columns of faces that are not used: red, green, blue, alpha": (
-        "a.ply",
-        BOTH.replace("end_header", FACES_RGBA)
-        .replace("3 0 1 2", "3 0 1 2 1 1 1 0")
-        .replace("3 0 2 3", "3 0 2 3 9 9 9 9"),
-    ),
-    "columns of faces that are not used: flags, quality": (
-        "a.ply",
-        BOTH.replace("end_header", FLAGS).replace("3 0 1 2", "3 0 1 2 0 0").replace("3 0 2 3", "3 0 2 3 0 0"),
-    ),
-    "ignored: classification of vertices; withheld of vertices": (
-        "a.ply",
-        square_ply("uchar", ["classification", "withheld"], (7, 1)),
-    ),
-    "ignored: numbers behind the coordinates of vertices": ("a.obj", SEVERAL),
+    "columns of faces that are not used: red, green, blue, alpha": of_faces(BOTH, FACES_RGBA, "1 1 1 0", "9 9 9 9"),
+    "columns of faces that are not used: flags, quality": of_faces(BOTH, FLAGS, "0 0", "0 0"),
+    "ignored: classification of vertices; withheld of vertices": square_ply("uchar", LASER, (7, 1)),
 }
 
 
 @pytest.mark.parametrize("line", UNUSED)
 def test_what_a_mesh_holds_and_is_not_used_is_said(tmp_path, line):
-    assert line in read(write(tmp_path, *UNUSED[line]), num_points=9)[1]
+    assert line in read(write(tmp_path, "a.ply", UNUSED[line]), num_points=9)[1]
 
 
-def test_normals_behind_the_colours_of_an_obj_are_no_alpha(tmp_path):
-    content = by_corner("".join(f"v {c} 1 1 0 ? 0 1\n" for c in CORNERS), 0, 0, 0, 1) + TWO_OF_OBJ
+@pytest.mark.parametrize(("behind", "values"), [("?", (1, 1, 2, 1)), ("1 1 0 ? 0 1", (0, 0, 0, 1))])
+def test_weights_and_normals_behind_the_vertices_of_an_obj_are_said_and_no_alpha(tmp_path, behind, values):
+    content = by_corner("".join(f"v {c} {behind}\n" for c in CORNERS), *values) + TWO_OF_OBJ
     lines = read(write(tmp_path, "a.obj", content), num_points=9)[1]
     assert "ignored: numbers behind the coordinates of vertices" in lines
     assert not any("alpha" in line for line in lines)

@@ -47,6 +47,7 @@ MILLIMETRES = "".join(",".join(f'"{x:,}"' for x in row) + "\n" for row in BALL_I
 QUOTED = "\n".join(",".join(f'"{x}"'.replace(".", ",") for x in point) for point in BALL.tolist())
 POINT_LINES = "".join("v {:g} {:g} {:g}\n".format(*point) for point in POINTS)
 SPARSE = "".join(f"{row},{'' if i % 4 else 'chair'}\n" for i, row in enumerate(table(",").splitlines()))
+NAMES, BARE_COMMAS = "b g r z y x\n", re.sub(r"\b0,", ",", table(";", ";tree", comma=True))
 TEXTS = {
     "tabs and empty lines": ("a.tsv", table("\t", "\n")),
     "a byte order mark": ("a.csv", "\ufeffX;Y;Z;R;G;B\n" + table(";")),
@@ -77,22 +78,13 @@ TEXTS = {
     "packed colours in words": ("a.csv", "x,y,z,colour\n" + table(",", ",#28AA3C", columns=POINTS)),
     "packed opaque colours": ("a.csv", "x,y,z,hex\n" + table(",", ",#28AA3Cff", columns=POINTS)),
     "packed colours in words, without names": ("a.txt", table(" ", " 0x28aa3c", columns=POINTS)),
-    "rows of dashes": (
-        "a.txt",
-        "b g r z y x\n" + 150 * "- - - - - -\n" + table(" ", columns=BACKWARDS) + "1 - 1 1 2 3\n",
-    ),
+    "rows of dashes": ("a.txt", NAMES + 150 * "- - - - - -\n" + table(" ", columns=BACKWARDS) + "1 - 1 1 2 3\n"),
     "first rows undefined": ("a.csv", "b,g,r,z,y,x\n" + 150 * ",,null,,,\n" + table(",", columns=BACKWARDS)),
-    "a first row with words and without a number": (
-        "a.csv",
-        "i,x,y,z,r,g,b\nP,null,1,1,1,2,3\n" + WORDY.split("\n", 1)[1],
-    ),
+    "a first row with words": ("a.csv", "i,x,y,z,r,g,b\nP,null,1,1,1,2,3\n" + WORDY.split("\n", 1)[1]),
     "a label that is empty, then words": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,\n" + table(",", ",car")),
     "labels here and there": ("a.csv", "x,y,z,r,g,b,name\n" + SPARSE),
     "labels here and there, not in the first row": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,\n" + SPARSE),
-    "numbers of points of which the first has a letter": (
-        "a.csv",
-        "x,y,z,r,g,b,name\n9,nan,9,1,2,3,A1\n" + table(",", ",12"),
-    ),
+    "numbers, the first with a letter": ("a.csv", "x,y,z,r,g,b,name\n9,nan,9,1,2,3,A1\n" + table(",", ",12")),
     "names behind a word": ("a.txt", "# columns: b g r z y x\n" + table(" ", columns=BACKWARDS)),
     "a title like names": ("a.txt", "xyz\n" + table(" ")),
     "names in one word": ("a.txt", "# bgrzyx\n" + table(" ", columns=BACKWARDS)),
@@ -124,10 +116,7 @@ TEXTS = {
     "decimal commas between blanks": ("a.txt", table(" ", comma=True)),
     "an array's columns by number, as pandas writes them": ("a.csv", "0,1,2,3,4,5\n" + table(",")),
     "counts of points and columns": ("a.xyz", "420 6\n" + table(" ")),
-    "decimal commas without a 0 before them, and a label": (
-        "a.csv",
-        "x;y;z;r;g;b;label\n,5;,25;nan;1;2;3;7\n" + re.sub(r"\b0,", ",", table(";", ";tree", comma=True)),
-    ),
+    "decimal commas without a 0, and a label": ("a.csv", "x;y;z;r;g;b;label\n,5;,25;nan;1;2;3;7\n" + BARE_COMMAS),
     "units without brackets": ("a.csv", "x,y,z,r,g,b\nm,m,m,-,-,-\n" + table(",")),
     "names of other programs": ("a.csv", "POINT_X,Point-Y,point.z,Color.R,color_g,Color B\n" + table(",")),
     "a time before each point": ("a.txt", table(" ", columns=TIMED)),
@@ -208,92 +197,39 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
     np.testing.assert_allclose(cloud.base_color, SRGB[colors], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "line"),
-    [
-        ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
-        ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
-        (
-            "a.txt",
-            table(" ", columns=LABELED),
-            "the 7 columns, which have no names, taken as x y z r g b scalar; r g b may",
-        ),
-        ("a.npy", as_npy(ODD), "columns that are not used: name (words), fpfh (33 numbers)"),
-        ("a.csv", ",".join(NUMBERED) + "\n" + table(",", columns=NUMBERS), "columns that are not used: c0, c1, c2, c3"),
-        ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
-        (
-            "a.csv",
-            "id,x,y,z\n" + table(",", columns=HASHED),
-            "210 rows that begin with a mark of remarks (# // %) are not read",
-        ),
-        (
-            "a.txt",
-            "# 1:z 2:y 3:x\n" + table(" ", columns=POINTS),
-            "lines that may name the columns in another order, and are",
-        ),
-        ("a.csv", "x,y,z,r,g,b,R\n" + table(",", ",0"), "names that occur twice, of which the first column is read: r"),
-        (
-            "a.csv",
-            "x,y,z,hex\n" + table(",", ",#28aa3c", columns=POINTS) + "1,2,3,none\n",
-            "1 of 421 colours are no number or #rrggbb, and",
-        ),
-        ("a.csv", MILLIMETRES, "whole numbers among small ones of three decimals in x, y, z: write thousands"),
-        (
-            "a.csv",
-            "x,y,z,u,v\ntop left,,\nm,m,m,,\n" + GREYS,
-            "lines below the names that are not read: top left,,, m,m,m,,",
-        ),
-        (
-            "a.csv",
-            "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF),
-            "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
-        ),
-        (
-            "a.csv",
-            "x,y,z,rgb_1,rgb_2,rgb_3,rgb_4\n" + table(",", columns=HALF),
-            "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)",
-        ),
-        (
-            "a.csv",
-            "x,y,z,albedo_r,albedo_g,albedo_b\n" + table(","),
-            "base_color_r base_color_g base_color_b taken as linear in 0..255",
-        ),
-        (
-            "a.csv",
-            "x,y,z,rgb\n" + table(",", ",99999", columns=POINTS) + "1,2,3,nan\n",
-            "1 of 421 colours are no number or #rrggbb, and taken as black",
-        ),
-        (
-            "a.npz",
-            pack_arrays({"points": BALL, "data": np.zeros((30, 9))}),
-            "arrays that are not used, which name no column of the 420 points: data",
-        ),
-        (
-            "a.npz",
-            pack_arrays(
-                dict(zip("xyz", BALL.T, strict=True)) | {"roughness": np.array(0.3), "cd": np.array(9 * ["a"])}
-            ),
-            "arrays that are not used, which name no column of the 420 points: roughness, cd",
-        ),
-        ("a.csv", "x,y,z,af,s\n" + GREYS, "columns that are not used: af, s"),
-        (
-            "a.npz",
-            pack_arrays({"v": BALL, "cd": np.uint8([GREEN] * 420)}),
-            "base_color_r base_color_g base_color_b taken as",
-        ),
-        ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
-        (
-            "a.npz",
-            pack_arrays({"points": BALL, "y": np.arange(420) % 4, "rgb": np.zeros(3)}),
-            "arrays that are not used, which name no column of the 420 points: y, rgb",
-        ),
-        (
-            "a.txt",
-            table(" ", columns=MOVING),
-            "the 6 columns, which have no names, taken as x y z intensity scalar scalar",
-        ),
-    ],
-)
+SEPARATE = dict(zip("xyz", BALL.T, strict=True))
+NO_COLUMNS = {"roughness": np.array(0.3), "cd": np.array(9 * ["a"])}
+LEFT_OUT = "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)"
+UNFIT = "arrays that are not used, which name no column of the 420 points: "
+LINEAR_BYTES = "base_color_r base_color_g base_color_b taken as linear in 0..255"
+ASSUMED = [  # file, beginning of a line that is said about it
+    ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
+    ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
+    ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar; r g b"),
+    ("a.npy", as_npy(ODD), "columns that are not used: name (words), fpfh (33 numbers)"),
+    ("a.csv", ",".join(NUMBERED) + "\n" + table(",", columns=NUMBERS), "columns that are not used: c0, c1, c2, c3"),
+    ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
+    ("a.csv", "id,x,y,z\n" + table(",", columns=HASHED), "210 rows that begin with a mark of remarks (# // %)"),
+    ("a.txt", "# 1:z 2:y 3:x\n" + table(" ", columns=POINTS), "lines that may name the columns in another order, and"),
+    ("a.csv", "x,y,z,r,g,b,R\n" + table(",", ",0"), "names that occur twice, of which the first column is read: r"),
+    ("a.csv", f"x,y,z,hex\n{table(',', ',#28aa3c', columns=POINTS)}1,2,3,none\n", "1 of 421 colours are no numb"),
+    ("a.csv", MILLIMETRES, "whole numbers among small ones of three decimals in x, y, z: write thousands"),
+    ("a.csv", f"x,y,z,u,v\ntop left,,\nm,m,m,,\n{GREYS}", "lines below the names that are not read: top left,,, m,"),
+    ("a.csv", "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF), LEFT_OUT),
+    ("a.csv", "x,y,z,rgb_1,rgb_2,rgb_3,rgb_4\n" + table(",", columns=HALF), LEFT_OUT),
+    ("a.csv", "x,y,z,albedo_r,albedo_g,albedo_b\n" + table(","), LINEAR_BYTES),
+    ("a.csv", f"x,y,z,rgb\n{table(',', ',99999', columns=POINTS)}1,2,3,nan\n", "1 of 421 colours are no number or #"),
+    ("a.npz", pack_arrays({"points": BALL, "data": np.zeros((30, 9))}), UNFIT + "data"),
+    ("a.npz", pack_arrays(SEPARATE | NO_COLUMNS), UNFIT + "roughness, cd"),
+    ("a.csv", "x,y,z,af,s\n" + GREYS, "columns that are not used: af, s"),
+    ("a.npz", pack_arrays({"v": BALL, "cd": np.uint8([GREEN] * 420)}), LINEAR_BYTES),
+    ("a.npz", pack_arrays({"coord": BALL, "faces": BALL, "id": BALL}), "arrays that are not used: faces, id"),
+    ("a.npz", pack_arrays({"points": BALL, "y": np.arange(420) % 4, "rgb": np.zeros(3)}), UNFIT + "y, rgb"),
+    ("a.txt", table(" ", columns=MOVING), "the 6 columns, which have no names, taken as x y z intensity scalar scalar"),
+]
+
+
+@pytest.mark.parametrize(("name", "data", "line"), ASSUMED)
 def test_what_is_assumed_or_not_used_is_said(tmp_path, name, data, line):
     lines = read(write(tmp_path, name, data))[1]
     assert any(found.startswith(line) for found in lines)
