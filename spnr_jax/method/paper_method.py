@@ -49,17 +49,24 @@ class Samples(NamedTuple):
     summed: Any
 
 
-class RenderedRays(NamedTuple):
-    """Rays after compositing: the sums of the samples' values or, decoded, features (the first three are RGB on white);
-    expected distance, opacity."""
+class CompositedRays(NamedTuple):
+    """Rays after compositing: the composited values `summed`, opacity, and expected distance."""
 
-    features: Any
+    summed: Any
+    acc: Array
+    depth: Array
+
+
+class RenderedRays(NamedTuple):
+    """Rays of objects: features (the first three are RGB on white), expected distance, opacity."""
+
+    features: Float[Array, "*rays k"]
     depth: Float[Array, "*rays"]
     acc: Float[Array, "*rays"]
 
 
 Field = Callable[[Float[Array, "*rays samples"]], Samples]
-Decode = Callable[[Any, Float[Array, "*rays"]], Float[Array, "*rays k"]]
+Decode = Callable[[CompositedRays], Float[Array, "*rays k"]]
 
 
 class PaperNetwork(nn.Module):
@@ -100,14 +107,17 @@ class PaperNetwork(nn.Module):
         return round(camera.height * ratio), round(camera.width * ratio)
 
     def make_field(self, scene: Scene, rays: Rays, objects: Int[Array, "*rays"]) -> tuple[Field, Decode]:
-        """The field along rays (density, emitted values), and the function from their sums and opacity to features."""
+        """The field along rays (density, emitted values), and the function from composited values to features."""
         view = self.field.view(rays.directions)
 
         def field(distances: Float[Array, "*rays samples"]) -> Samples:
             owners = jnp.broadcast_to(objects[..., None], distances.shape)
             return Samples(*self.field(voxels.trilinear(scene.volume, locate_samples(rays, distances), owners), view))
 
-        return field, partial(self.field.decode, view=view)
+        def decode(composited: CompositedRays) -> Float[Array, "*rays features"]:
+            return self.field.decode(composited.summed, composited.acc, view)
+
+        return field, decode
 
     def decode_images(self, camera: Camera, rendered: RenderedRays) -> Rendering:
         """Images from the rays of `rays`: the feature image is resized, and the upsampler doubles it."""
@@ -137,7 +147,8 @@ def render_rays(
     """Renders rays (objects, rays, ...).  A key jitters the samples; each ray folds in its own number.
 
     `block_size` rays are rendered at once; None: all, or a default if samples lie only near points.  The network is a
-    bound Linen module: its `make_field(scene, rays, objects)` and `config.num_features`.
+    bound Linen module.  `make_field(scene, rays, objects)` returns its field and the function from `CompositedRays` to
+    features; `config.num_features` is the number of features of a ray.
     """
     shape = rays.origins.shape[:-1]
     number = jnp.arange(shape[0] * shape[1]).reshape(shape)
@@ -170,8 +181,8 @@ def _on_one_device(
     def block(objects, number, rays):
         field, decode = make_network().make_field(scene, rays, objects)
         keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-        marched = march(field, _path(near_points, rays, objects), samples, keys)
-        return marched._replace(features=decode(marched.features, marched.acc))
+        composited = march(field, _path(near_points, rays, objects), samples, keys)
+        return RenderedRays(decode(composited), composited.depth, composited.acc)
 
     if block_size is None and samples.reach:
         block_size = CPU_BLOCK if key is None and jax.default_backend() == "cpu" else RAY_BLOCK
@@ -206,8 +217,8 @@ def locate_samples(rays: Rays, distances: Float[Array, "*rays samples"]) -> Floa
     return clamp(rays.origins[..., None, :] + distances[..., None] * rays.directions[..., None, :], -1, 1)
 
 
-def march(field: Field, path: RayPath, counts: SamplingConfig, key: Key | None) -> RenderedRays:
-    """Renders a field along paths, not decoded; `key` is one key for all rays, or one per ray."""
+def march(field: Field, path: RayPath, counts: SamplingConfig, key: Key | None) -> CompositedRays:
+    """Renders a field along paths; `key` is one key for all rays, or one per ray."""
     coarse_key, fine_key = (None, None) if key is None else sampling.split(key)
     length, far = path.travelled[..., -1], path.edges[..., -1]
     coarse, edges = sampling.stratified(coarse_key, jnp.zeros_like(length), length, counts.num_coarse)
@@ -228,8 +239,8 @@ def march(field: Field, path: RayPath, counts: SamplingConfig, key: Key | None) 
         jax.tree.map(partial(compositing.composite, share), samples.summed)
         for share, samples in zip(shares, passes, strict=True)
     ]
-    return RenderedRays(
-        features=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
+    return CompositedRays(
+        summed=jax.tree.map(lambda *parts: reduce(operator.add, parts), *sums),
         acc=jnp.sum(weights, axis=-1),
         depth=compositing.expected_distance(weights, voxels.distance_at(path, travelled), far),
     )
