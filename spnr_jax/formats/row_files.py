@@ -29,7 +29,7 @@ from spnr_jax.formats.point_tables import load_text
 Properties = list[tuple[str, str, Any]]  # name, type, number of items, or for a list the type of its length
 Lists = dict[str, tuple[np.ndarray, ...]]  # lengths (rows,), and the items of all rows concatenated
 
-PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of a piece in memory, at most
+PIECE_BYTES, PIECE_LINES = 2**25, 2**17  # of a piece in memory
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
@@ -60,7 +60,8 @@ def read_rows(file: BufferedIOBase, count: int, properties: Properties, text: bo
             lengths = {name: int(found[0][0]) for name, found in _any_rows(file, 1, properties, text, done)[1].items()}
             file.seek(place)
         layout, words = _layout(properties, lengths)
-        wanted = min(count - done, PIECE_LINES, max(1, PIECE_BYTES // max(1, layout.itemsize)))
+        fitting = max(1, PIECE_BYTES // max(1, layout.itemsize))
+        wanted = min(count - done, PIECE_LINES if text or lists else fitting, PIECE_LINES if text else fitting)
         try:
             lines = list(enumerate(islice(_lines(file), wanted), done)) if text else []
             data = b"" if text else file.read(wanted * layout.itemsize)
