@@ -170,7 +170,15 @@ def repeat(document):
 
 
 TRANSMISSION = {"KHR_materials_transmission": {"transmissionFactor": 0.5}}
-OUTSIDE = "../secret.png", "a/../../secret.png", "/etc/hostname", "..%2fsecret.png", "file:///x", "C:\\x.png"
+OUTSIDE = (
+    "../secret.png",
+    "a/../../secret.png",
+    "/etc/hostname",
+    "..%2fsecret.png",
+    "file:///x",
+    "C:\\x.png",
+    "w\ud83d.png",
+)
 REFUSED = (
     (glass(alphaMode="BLEND"), "is transparent: material 'glass' has alphaMode BLEND"),
     (glass(alphaMode="MASK"), "is transparent: material 'glass' has alphaMode MASK"),
@@ -181,7 +189,7 @@ REFUSED = (
     (square(change=lambda d: d["accessors"][0].update(sparse={})), "accessor 0 is sparse"),
     (square(GltfBuilder(asset={"version": "1.0"})), "glTF 1.0"),
     (glass("textures/gone.png"), "missing: 'textures/gone.png'"),
-    *((glass(uri), "names a file that is missing") for uri in (*OUTSIDE, "w\ud83d.png")),
+    *((glass(uri), "names a file that is missing") for uri in OUTSIDE),
     (glass("broken.png"), "broken.png"),
     (glass(pbrMetallicRoughness={"roughnessFactor": [0.1, 0.2, 0.3]}), "roughness of shape (3,)"),
     (glass("a.ktx2"), "cannot be read: a.ktx2 (KTX2, which is not read: convert it to PNG"),

@@ -199,26 +199,31 @@ def test_an_intensity_that_is_the_luminance_of_the_colours_is_none_of_them(tmp_p
 
 SEPARATE = dict(zip("xyz", BALL.T, strict=True))
 NO_COLUMNS = {"roughness": np.array(0.3), "cd": np.array(9 * ["a"])}
+UNNAMED = "the 7 columns, which have no names, taken as "
+REMARKS = "210 rows that begin with a mark of remarks (# // %) are not read"
+ORDER = "lines that may name the columns in another order, and are"
+NO_COLOR = "1 of 421 colours are no number or #rrggbb, and taken as black"
+BELOW = "lines below the names that are not read: "
 LEFT_OUT = "210 of 420 points left out: opacity near 0 (--keep-noise keeps them)"
 UNFIT = "arrays that are not used, which name no column of the 420 points: "
 LINEAR_BYTES = "base_color_r base_color_g base_color_b taken as linear in 0..255"
 ASSUMED = [  # file, beginning of a line that is said about it
     ("a.pts", "999\n" + table(" "), "a line of the file announces 999 points, 420 are there: is the file cut off?"),
     ("a.pts", "300\n" + table(" ") + "100\n", "a line of the file announces 400 points, 420 are there"),
-    ("a.txt", table(" ", columns=LABELED), "the 7 columns, which have no names, taken as x y z r g b scalar; r g b"),
+    ("a.txt", table(" ", columns=LABELED), UNNAMED + "x y z r g b scalar; r g b may"),
     ("a.npy", as_npy(ODD), "columns that are not used: name (words), fpfh (33 numbers)"),
     ("a.csv", ",".join(NUMBERED) + "\n" + table(",", columns=NUMBERS), "columns that are not used: c0, c1, c2, c3"),
     ("a.csv", "x,y,z,Roughness (0.1),label\n" + GREYS, "columns that are not used: roughness (0.1), label"),
-    ("a.csv", "id,x,y,z\n" + table(",", columns=HASHED), "210 rows that begin with a mark of remarks (# // %)"),
-    ("a.txt", "# 1:z 2:y 3:x\n" + table(" ", columns=POINTS), "lines that may name the columns in another order, and"),
+    ("a.csv", "id,x,y,z\n" + table(",", columns=HASHED), REMARKS),
+    ("a.txt", "# 1:z 2:y 3:x\n" + table(" ", columns=POINTS), ORDER),
     ("a.csv", "x,y,z,r,g,b,R\n" + table(",", ",0"), "names that occur twice, of which the first column is read: r"),
-    ("a.csv", f"x,y,z,hex\n{table(',', ',#28aa3c', columns=POINTS)}1,2,3,none\n", "1 of 421 colours are no numb"),
+    ("a.csv", "x,y,z,hex\n" + table(",", ",#28aa3c", columns=POINTS) + "1,2,3,none\n", NO_COLOR),
     ("a.csv", MILLIMETRES, "whole numbers among small ones of three decimals in x, y, z: write thousands"),
-    ("a.csv", f"x,y,z,u,v\ntop left,,\nm,m,m,,\n{GREYS}", "lines below the names that are not read: top left,,, m,"),
+    ("a.csv", "x,y,z,u,v\ntop left,,\nm,m,m,,\n" + GREYS, BELOW + "top left,,, m,m,m,,"),
     ("a.csv", "x,y,z,color_r,color_g,color_b,a\n" + table(",", columns=HALF), LEFT_OUT),
     ("a.csv", "x,y,z,rgb_1,rgb_2,rgb_3,rgb_4\n" + table(",", columns=HALF), LEFT_OUT),
     ("a.csv", "x,y,z,albedo_r,albedo_g,albedo_b\n" + table(","), LINEAR_BYTES),
-    ("a.csv", f"x,y,z,rgb\n{table(',', ',99999', columns=POINTS)}1,2,3,nan\n", "1 of 421 colours are no number or #"),
+    ("a.csv", "x,y,z,rgb\n" + table(",", ",99999", columns=POINTS) + "1,2,3,nan\n", NO_COLOR),
     ("a.npz", pack_arrays({"points": BALL, "data": np.zeros((30, 9))}), UNFIT + "data"),
     ("a.npz", pack_arrays(SEPARATE | NO_COLUMNS), UNFIT + "roughness, cd"),
     ("a.csv", "x,y,z,af,s\n" + GREYS, "columns that are not used: af, s"),
