@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
@@ -38,6 +37,7 @@ from spnr_jax.surfels.candidates import CANDIDATES, Candidates, Nodes, build_gra
 from spnr_jax.surfels.geometry import PointColumns
 from spnr_jax.surfels.neighbors import order_in_space
 from spnr_jax.training.trainer import check_finite
+from spnr_jax.training.weights import write_variables
 
 VARIANTS = 2  # of each mesh: itself, and a stretched one
 RATE = 2e-3  # of learning, the highest, after which it falls along a cosine
@@ -403,8 +403,7 @@ def train(options: Options) -> None:
             sums = []
         if step % 300 == 299 or step + 1 == options.steps:
             state["step"] = step + 1
-            flat = {name: np.asarray(x, np.float16) for name, x in flatten_dict(state["params"], sep="/").items()}
-            write_whole(options.out / "densifier.npz", pack_arrays(flat, compressed=True))
+            write_variables(options.out / "densifier.npz", state["params"])
             kept = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
             write_whole(checkpoint, pack_arrays(kept))  # last: a training that is killed before it makes both again
 

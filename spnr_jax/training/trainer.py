@@ -117,7 +117,10 @@ def take_step(
 
 
 def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Trained | None) -> optimisation.TrainState:
-    """The state to continue from (the newest checkpoint, or before the first step), and a message about it."""
+    """The state to continue from (the newest checkpoint, or before the first step), and a message about it.
+
+    A new run keeps the companion networks of its initial weights.
+    """
     with programs.use_mesh(mesh):
         sharding = None if mesh is None else NamedSharding(mesh, PartitionSpec())  # every device holds it whole
         if (state := checkpoint.restore(run, config, tqdm.write, sharding)) is None:

@@ -9,7 +9,7 @@ contains only weights.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import resources
@@ -63,8 +63,7 @@ def keep_companions(run: Path, trained: Trained) -> None:
     """Writes the network's companions to a run folder, which trains with them; a file that is there stays."""
     for name in method_of(trained.config.model).companions:
         if not (path := run / f"{name}.npz").exists():
-            weights = flatten_dict(trained.variables[name], sep="/")
-            write_whole(path, pack_arrays({x: np.asarray(w, np.float16) for x, w in weights.items()}, compressed=True))
+            write_variables(path, trained.variables[name])
 
 
 def locate(source: Path | str | None) -> Path:
@@ -92,6 +91,12 @@ def read_variables(path: Path) -> dict:
     """The variables of a file that contains only weights, float16 by name."""
     with path.open("rb") as file:
         return _as_variables(read_arrays(file))
+
+
+def write_variables(path: Path, variables: Mapping) -> None:
+    """Writes the file that `read_variables` reads."""
+    halves = {name: np.asarray(values, np.float16) for name, values in flatten_dict(variables, sep="/").items()}
+    write_whole(path, pack_arrays(halves, compressed=True))
 
 
 def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:

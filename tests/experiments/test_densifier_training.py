@@ -6,6 +6,7 @@ import pytest
 
 from experiments.packaged import densifier_training
 from spnr_jax.errors import UserError
+from spnr_jax.training import weights
 
 
 def test_the_densifier_trains_on_no_mesh_of_the_test_list(tmp_path, monkeypatch):
@@ -54,10 +55,11 @@ def test_a_training_that_is_killed_between_its_files_goes_on_to_the_same(small, 
         left[0] -= 1
         write(path, content)
 
-    monkeypatch.setattr(densifier_training, "write_whole", stop)
-    with pytest.raises(KeyboardInterrupt):
-        densifier_training.train(killed)
-    monkeypatch.setattr(densifier_training, "write_whole", write)
+    with monkeypatch.context() as patch:
+        for module in (densifier_training, weights):  # the checkpoint, the densifier
+            patch.setattr(module, "write_whole", stop)
+        with pytest.raises(KeyboardInterrupt):
+            densifier_training.train(killed)
     densifier_training.train(killed)
     for name in ("densifier.npz", "checkpoint.npz"):
         assert (killed.out / name).read_bytes() == (whole.out / name).read_bytes(), name
