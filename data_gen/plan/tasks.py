@@ -11,6 +11,7 @@ rendered is in no split and takes nobody's place.
 """
 
 import hashlib
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -162,9 +163,9 @@ def check_options(config: GenerateConfig) -> None:
     require_at_least(config, 0, "objects", "colour_variants", "test_objects", "seed")
     if not 0 < config.fov < 180:
         raise UserError(f"--fov: expected degrees between 0 and 180, got {config.fov:g}")
-    if not config.distance > 1:
+    if not 1 < config.distance < math.inf:
         raise UserError(f"--distance: expected more than 1, outside the object's unit sphere, got {config.distance:g}")
-    if min(config.val_fraction, config.test_fraction) < 0 or config.val_fraction + config.test_fraction >= 1:
+    if not (min(config.val_fraction, config.test_fraction) >= 0 and config.val_fraction + config.test_fraction < 1):
         raise UserError("--val-fraction, --test-fraction: expected shares that leave some objects to train on")
     if config.envmap and not config.envmap.is_file():
         raise UserError(f"--envmap {config.envmap}: no such file; give a latitude-longitude .hdr or .exr")

@@ -43,7 +43,7 @@ def show(config: ShowConfig) -> Path:
     require_at_least(config, 1, "objects")
     object_ids = sorted(layout.list_completed(config.dataset))
     if not object_ids:
-        raise UserError(f"{config.dataset} holds no finished object yet; run spnr-data generate again")
+        raise UserError(f"{config.dataset} holds no objects/ID/object.json yet, which spnr-data generate writes last")
     chosen = np.unique(np.linspace(0, len(object_ids) - 1, min(config.objects, len(object_ids))).round().astype(int))
     page = template(Path(__file__).with_name("contact_sheet.html")).render(
         title=f"{config.dataset.resolve().name}: {len(chosen)} of {len(object_ids)} objects",
