@@ -126,7 +126,7 @@ def restore_or_init(config: TrainConfig, run: Path, mesh: Mesh | None, init: Tra
         if (state := checkpoint.restore(run, config, tqdm.write, sharding)) is None:
             state = new_state(config, init)
             if init is not None:
-                keep_companions(run, init)
+                keep_companions(run, init, tqdm.write)
         # as restored states are: else the step would be compiled once more for a run that goes on
         state = jax.device_put(state, sharding or jax.local_devices()[0])
     if (step := int(state.step)) >= config.num_steps:

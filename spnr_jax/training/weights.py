@@ -59,11 +59,16 @@ def own_companions(config: NetworkConfig, source: Path) -> dict[str, Path]:
     return {name: path for name, path in files.items() if path.is_file()}
 
 
-def keep_companions(run: Path, trained: Trained) -> None:
-    """Writes the network's companions to a run folder, which trains with them; a file that is there stays."""
+def keep_companions(run: Path, trained: Trained, say: Callable[[str], None] = print) -> None:
+    """Writes the network's companions to a run folder, which trains with them.
+
+    A file that is there stays; `say` gets a line if it has other weights.
+    """
     for name in method_of(trained.config.model).companions:
         if not (path := run / f"{name}.npz").exists():
             write_variables(path, trained.variables[name])
+        elif _pack_variables(read_variables(path)) != _pack_variables(trained.variables[name]):
+            say(f"{path} is used, not the {name} of the initial weights; for that, stop, remove it and begin again")
 
 
 def locate(source: Path | str | None) -> Path:
@@ -95,8 +100,13 @@ def read_variables(path: Path) -> dict:
 
 def write_variables(path: Path, variables: Mapping) -> None:
     """Writes the file that `read_variables` reads."""
-    halves = {name: np.asarray(values, np.float16) for name, values in flatten_dict(variables, sep="/").items()}
-    write_whole(path, pack_arrays(halves, compressed=True))
+    write_whole(path, _pack_variables(variables))
+
+
+def _pack_variables(variables: Mapping) -> bytes:
+    """The content of that file, the same whatever the order of the names."""
+    named = sorted(flatten_dict(variables, sep="/").items())
+    return pack_arrays({name: np.asarray(values, np.float16) for name, values in named}, compressed=True)
 
 
 def load(run: Path | str | None = None, methods: Path | str | None = None) -> Model:

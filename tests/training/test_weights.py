@@ -71,15 +71,17 @@ def test_a_densifier_beside_the_weights_or_in_the_run_comes_before_that_of_the_p
         jax.tree.map(lambda x, y: close(x, y, rtol=1e-3), weights.read_trained(source).variables["densifier"], own)
 
 
-def test_a_run_trains_with_the_densifier_of_its_first_weights_or_with_one_that_is_there(tmp_path):
+def test_a_run_trains_with_the_densifier_of_its_first_weights_or_with_one_that_is_there_and_says_so(tmp_path, capsys):
     run, trained = tmp_path / "run", weights.read_trained(None)
     run.mkdir()
-    for factor in (2, 3):
+    for factor in (2, 2, 3):
+        assert not capsys.readouterr().out
         own = jax.tree.map(lambda x, f=factor: f * x, trained.variables["densifier"])
         init = dataclasses.replace(trained, variables=trained.variables | {"densifier": own})
         trainer.restore_or_init(trained.config, run, None, init)
         found = weights.add_companions(trained.config.model, {}, run)["densifier"]
         jax.tree.map(lambda x, y: close(x, 2 * y, rtol=1e-3), found, trained.variables["densifier"])
+    assert "densifier.npz is used, not the densifier of the initial weights" in capsys.readouterr().out
 
 
 def test_a_name_is_the_packages_network_and_a_path_is_not(monkeypatch, tmp_path):
