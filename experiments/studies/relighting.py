@@ -26,7 +26,7 @@ from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import mean
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
-from spnr_jax.errors import UserError, require_at_least
+from spnr_jax.errors import UserError, require, require_at_least
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import ObjectData
 from spnr_jax.kernels.imaging import srgb_to_linear
@@ -68,6 +68,7 @@ class RelightingStudy:
     """Test objects (default: all)."""
 
     def __post_init__(self) -> None:
+        require(bool(self.data), "--data: name at least one data set")
         require_at_least(self, 1, "counts", "resolution", "views", "objects")
 
 

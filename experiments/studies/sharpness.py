@@ -33,7 +33,7 @@ from experiments.comparison.study_objects import cut, test_objects
 from experiments.comparison.view_scores import WELL_INSIDE, measure_sharpness
 from spnr_jax.config import Quality
 from spnr_jax.devices import runtime
-from spnr_jax.errors import require_at_least
+from spnr_jax.errors import require, require_at_least
 from spnr_jax.formats import data_sets, images
 from spnr_jax.formats.data_sets import Dataset, ObjectData
 from spnr_jax.kernels.cloud_arrays import make_cloud
@@ -82,6 +82,7 @@ class SharpnessStudy:
     """Give the networks the normals of the data set, too; without them they are estimated."""
 
     def __post_init__(self) -> None:
+        require(bool(self.runs) or self.poisson, "--runs: name at least one network, or give --poisson")
         require_at_least(self, 1, "counts", "resolution", "views", "objects")
 
 

@@ -266,6 +266,15 @@ def test_numbers_that_an_experiment_cannot_use_are_refused_by_name(study, name, 
         study(**{name: value})
 
 
+@pytest.mark.parametrize(
+    ("study", "name"),
+    [(relighting.RelightingStudy, "data"), (sharpness.SharpnessStudy, "runs"), (table1.Table1, "methods")],
+)
+def test_an_experiment_on_nothing_is_refused_by_name(study, name):
+    with pytest.raises(ValueError, match=f"^--{name}: name at least one"):
+        study(**DATA | {name: ()})
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize("left_out", [("point_nerf", "points2nerf"), pytest.param((), marks=pytest.mark.slow)])
 def test_table_1_has_the_scores_of_the_evaluation_of_its_runs(left_out, data, tmp_path):
