@@ -189,8 +189,7 @@ def export_network(options: Export) -> str:
         "render": export_render(model, resolution=size, num_points=points, platforms=where),
     }
     weights.write_weights(out / "weights.npz", trained)
-    for path in weights.own_companions(trained.config.model, weights.locate(options.run)).values():
-        images.write_whole(out / path.name, path.read_bytes())
+    weights.write_companions(out, trained)
     room = {"tables": np.asarray(lighting.room_light().tables)}
     images.write_whole(out / "light.npz", pack_arrays(room, compressed=True))
     for name, content in functions.items():

@@ -48,15 +48,16 @@ def packaged_file(name: str = PACKAGED) -> Path:
 
 def add_companions(config: NetworkConfig, variables: dict, source: Path) -> dict:
     """The variables with those of companion networks (a densifier): the source's own, or else the package's."""
-    own, names = own_companions(config, source), method_of(config).companions
-    return variables | {name: read_variables(own.get(name, packaged_file(name))) for name in names}
-
-
-def own_companions(config: NetworkConfig, source: Path) -> dict[str, Path]:
-    """The files of companion networks in a run folder, or beside a file of weights, by name."""
     folder = source.parent if source.is_file() else source
-    files = {name: folder / f"{name}.npz" for name in method_of(config).companions}
-    return {name: path for name, path in files.items() if path.is_file()}
+    own = {name: folder / f"{name}.npz" for name in method_of(config).companions}
+    files = {name: path if path.is_file() else packaged_file(name) for name, path in own.items()}
+    return variables | {name: read_variables(path) for name, path in files.items()}
+
+
+def write_companions(folder: Path, trained: Trained) -> None:
+    """Writes the network's companions, beside its weights."""
+    for name in method_of(trained.config.model).companions:
+        write_variables(folder / f"{name}.npz", trained.variables[name])
 
 
 def keep_companions(run: Path, trained: Trained, say: Callable[[str], None] = print) -> None:
@@ -71,17 +72,12 @@ def keep_companions(run: Path, trained: Trained, say: Callable[[str], None] = pr
             say(f"{path} is used, not the {name} of the initial weights; for that, stop, remove it and begin again")
 
 
-def locate(source: Path | str | None) -> Path:
-    """The run folder or file that `read_trained` reads."""
-    return packaged_file() if source is None or str(source) == PACKAGED else Path(source)
-
-
 def read_trained(source: Path | str | None, say: Callable[[str], None] = print) -> Trained:
     """The network of a run folder's newest checkpoint, of a file of weights, or of the package (None, or its name).
 
     ValueError, with what to do, if there is none; `say` gets a line for each broken checkpoint.
     """
-    path = locate(source)
+    path = packaged_file() if source is None or str(source) == PACKAGED else Path(source)
     if path.suffix == ".npz":
         trained = read_weights(path)
         return replace(trained, variables=add_companions(trained.config.model, trained.variables, path))
