@@ -164,7 +164,11 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """Ends the process; after a stop without Python's end, which crashes of what JAX still compiles or computes."""
+    """Ends the process; after a stop without Python's end, which crashes of what JAX still compiles or computes.
+
+    A stop during Python's end, when the work is done, ends it at once with the same code.
+    """
+    signal.signal(signal.SIGINT, lambda number, frame: os._exit(code))
     if code == STOPPED:
         sys.stdout.flush()
         sys.stderr.flush()
@@ -221,9 +225,9 @@ def _obey_stops() -> Iterator[None]:
 
 
 def _is_stopping(thread: int) -> bool:
-    """Whether a thread is handling a KeyboardInterrupt, for example in a `finally`."""
+    """Whether a thread is handling a KeyboardInterrupt, for example in a `finally`, or closes a generator after one."""
     found: Any = sys._current_exceptions().get(thread)
     error = found[1] if isinstance(found, tuple) else found  # Python 3.11: with type and call stack
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    while error is not None and not isinstance(error, KeyboardInterrupt | GeneratorExit):
         error = error.__context__
     return error is not None

@@ -106,6 +106,17 @@ def tidied():
         time.sleep(5 * errors.AGAIN)
         print("tidied")
 
+def closed():
+    def lines():
+        try:
+            yield
+        finally:
+            time.sleep(5 * errors.AGAIN)
+            print("tidied")
+
+    for _ in lines():
+        interrupt()
+
 def computing():  # Python's end waits for JAX, or crashes
     import jax, jax.numpy as jnp
     jax.jit(lambda x: jax.lax.fori_loop(0, 10**6, lambda i, y: jnp.tanh(y @ y), x))(jnp.ones((400, 400)))
@@ -118,11 +129,25 @@ errors.leave(code)
 """
 
 
-@pytest.mark.parametrize("way", ["dropped", "caught", "changed", "tidied", "computing"])
+@pytest.mark.parametrize("way", ["dropped", "caught", "changed", "tidied", "closed", "computing"])
 def test_a_stop_is_obeyed_whatever_becomes_of_it_on_its_way(way):
     done = subprocess.run([sys.executable, "-c", STOPPED, way], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (130, "spnr: stopped\n")
-    assert done.stdout == ("tidied\n" if way == "tidied" else "")
+    assert done.stdout == ("tidied\n" if way in ("tidied", "closed") else "")
+
+
+ENDING = """
+import atexit, os, signal, time
+from spnr_jax import errors
+atexit.register(time.sleep, 20)
+atexit.register(os.kill, os.getpid(), signal.SIGINT)
+errors.leave(errors.guard(lambda: print("done"), "spnr"))
+"""
+
+
+def test_a_stop_after_the_work_is_done_ends_python_without_a_word():
+    done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
 def test_a_stop_while_a_command_is_imported_is_one_line(tmp_path):
