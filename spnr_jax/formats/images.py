@@ -35,6 +35,8 @@ PALETTE_FRAMES = 24  # frames, spread over the film, from which a GIF's palette 
 CENTISECOND = 0.01  # time unit of a GIF
 ROUNDED = 0.05  # share by which that may change the rate of frames without a word
 QUALITY = 10  # of an .mp4: constant rate factor, from 0 (the best) to 51
+# of an .mp4; where it is not named, players guess it by the size, some wrongly
+COLOR_SPACE = "colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 # viridis (Smith, van der Walt 2015) at 20 even steps, dark to bright; interpolation is off by at most 4 / 255
 VIRIDIS = (
     "440154 481467 482576 453781 404688 39558c 33638d 2d718e 287d8e 238a8d "
@@ -164,7 +166,8 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float | int) -> None
 
     height, width = (size - size % 2 for size in pictures[0].shape[:2])
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
-    wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY), "-v", "error", "-y"]
+    colors = ["-vf", f"scale=out_color_matrix=bt709,setparams={COLOR_SPACE}"]
+    wanted = [*colors, "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY), "-v", "error", "-y"]
     with _in_its_place(path) as unfinished, tempfile.TemporaryFile() as said:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), *given, *wanted, str(unfinished)]
         ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)

@@ -1,5 +1,6 @@
 import errno
 import importlib.util
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -101,6 +102,19 @@ def test_an_mp4_has_every_frame(tmp_path):
     path, reason = write_turntable(tmp_path / "a.mp4", [frame[:63, :61] for frame in shaded_frames(10)], fps=10)
     assert (path, reason) == (tmp_path / "a.mp4", "")
     assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 10
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs imageio-ffmpeg")
+def test_an_mp4_names_the_colour_space_that_its_colours_are_right_in(tmp_path):
+    import imageio_ffmpeg
+
+    colors = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200]], np.uint8)
+    path, _ = write_turntable(tmp_path / "a.mp4", [colors.repeat(16, axis=0)[:, None].repeat(32, axis=1)] * 2, fps=10)
+    about, content, _ = imageio_ffmpeg.read_frames(str(path))
+    shown = np.frombuffer(content, np.uint8).reshape(*about["size"][::-1], 3)[8::16, 16]
+    assert np.abs(shown.astype(int) - colors).max() <= 4
+    said = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", path], capture_output=True, text=True).stderr
+    assert "yuv420p(tv, bt709/bt709/iec61966-2-1" in said, "Chromium takes the matrix of unnamed HD films as bt709"
 
 
 @pytest.mark.parametrize("reads", ["", "cat > /dev/null; "])
