@@ -255,8 +255,8 @@ class Export:
     clean: Literal["auto", "off", "strong"] = "auto"
     """As for `spnr render`, for --splats."""
     out: Path = Path("exported")
-    """Folder for weights.npz, encode.jax, render.jax, both as .stablehlo, export.json with their inputs and outputs,
-    and light.npz, the room."""
+    """Folder for weights.npz, densifier.npz, encode.jax, render.jax, both as .stablehlo, export.json with their inputs
+    and outputs, and light.npz, the room."""
     num_points: int | None = None
     """Exact number of points of a cloud, padding included (default: 1,024).  With --splats, points kept of a larger
     cloud (default: 16,384)."""
