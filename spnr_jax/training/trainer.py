@@ -34,7 +34,7 @@ from spnr_jax.kernels.records import Light
 from spnr_jax.method.model import render_views
 from spnr_jax.methods import method_of
 from spnr_jax.training import checkpoint, optimisation
-from spnr_jax.training.weights import Trained, add_companions, write_companions, write_weights
+from spnr_jax.training.weights import Trained, add_companions, keep_companions, write_weights
 
 PREVIEWED = 6  # objects of a preview
 NETWORK = "weights.npz"  # of a finished run
