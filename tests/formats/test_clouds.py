@@ -179,6 +179,7 @@ def test_points_are_spread_evenly_over_a_mesh_unless_there_are_very_many(tmp_pat
     assert nearest(301) < 0.2
 
 
+@pytest.mark.ci
 def test_thinning_covers_each_side_of_a_thin_wall_whose_normals_are_given(tmp_path):
     front = np.arange(4000) % 2 == 0
     wall = np.random.default_rng(1).random((4000, 3)) * [1, 1, 0] + front[:, None] * [0, 0, 0.004]

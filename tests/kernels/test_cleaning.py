@@ -78,6 +78,7 @@ def test_nine_in_ten_uniform_outliers_go_and_the_surface_stays(shape, count):
     assert np.mean([mask[: -(count // 100)] for mask in apart]) < 0.001
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("shape", "distance"), [("sphere", from_sphere), ("box", from_box)])
 def test_averaging_takes_three_fifths_of_the_noise_of_one_per_cent(shape, distance):
     surface = SHAPES[shape](60000, "random")

@@ -98,6 +98,7 @@ def test_no_two_learned_points_are_nearer_than_the_closest(params):
     ).mean() > 0.95  # rivals are looked for at 12 neighbors
 
 
+@pytest.mark.ci
 def test_vmap_is_a_loop_and_a_program_is_the_plain_function(params):
     clouds = [ball(0), ball(1)]
     near = [spnr_jax.neighbors(x) for x in clouds]
@@ -198,6 +199,7 @@ def test_few_points_and_equal_ones_stay_finite(params, positions):
     np.testing.assert_array_equal(dense.mask[: len(positions)], True)
 
 
+@pytest.mark.ci
 def test_the_handle_densifies_sparse_clouds_alone(params, monkeypatch):
     monkeypatch.setattr(surfel_method, "_densify", lambda weights, *given: run({"densifier": weights}, *given))
     sparse = cloud(shape("sphere", 300)[0])

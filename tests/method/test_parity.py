@@ -102,6 +102,7 @@ def trained():
     return rendering, statistics, parts, gradients
 
 
+@pytest.mark.ci
 def test_images_losses_and_statistics_of_the_training(trained):
     rendering, statistics, losses_of, _ = trained
     agree(rendering.image[:, 0], pictures("train/image"))

@@ -12,6 +12,7 @@ from spnr_jax.formats.images import read_light
 from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.surfels.lighting import texel_directions
 
+pytestmark = pytest.mark.ci
 COUNT = 1400  # points of every body: few programs
 SIZE = 132  # more than those of pictures that are drawn at twice the size: means of sRGB are not linear in the light
 

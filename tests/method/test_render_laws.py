@@ -150,6 +150,7 @@ def test_a_plan_of_what_a_jitted_function_closes_over_is_that_of_outside(params,
     assert plan(scenes[0], shared) == plan(scenes[0], stacked(views[:2])), "one lens for all views"
 
 
+@pytest.mark.ci
 def test_nothing_traced_leaves_encode_and_padded_clouds_can_be_traced():
     points = cloud(shape("sphere", 90)[0])
     near = np.pad(neighbors(points), [(0, 38), (0, 0)], constant_values=-1)
@@ -205,6 +206,7 @@ def test_forward_mode_is_reverse_mode(params, scenes, views, lights, value_and_g
     close(forward(scenes[0].surfels.position, jnp.float32(1)), slope, rtol=2e-3, atol=1e-3)
 
 
+@pytest.mark.ci
 def test_gradients_are_central_differences_of_float64(params, scenes, views, lights, value_and_gradient):
     """By every number of scene, camera and light."""
     given, rng = (scenes[0], views[0], lights[0]), np.random.default_rng(7)

@@ -46,6 +46,7 @@ def wobbled(fresh):
     return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
 
 
+@pytest.mark.ci
 def test_weights_in_bfloat16_have_almost_the_same_outputs(wobbled):
     inputs, network = numbers(3, 1, 8, 8, NUM_FEATURES), Shader(CONFIG.widths, CONFIG.top)
     half, whole = (
@@ -56,6 +57,7 @@ def test_weights_in_bfloat16_have_almost_the_same_outputs(wobbled):
     close(half, whole, atol=0.05 * float(jnp.abs(whole).max()))
 
 
+@pytest.mark.ci
 def test_more_padding_changes_no_surfel_of_a_rod_thinner_than_a_cell_of_the_depth_buffers():
     rod = cloud(shape("rod", 1200)[0] * np.float32([0.02, 0.02, 1]))
     narrow, wider = (encode_in_box(rod, count).surfels for count in (2048, 8192))
@@ -66,6 +68,7 @@ def test_more_padding_changes_no_surfel_of_a_rod_thinner_than_a_cell_of_the_dept
         assert np.mean(change > 1e-3) < 2e-3, name  # by rounding, a point may lie in the next cell
 
 
+@pytest.mark.ci
 def test_an_eye_close_to_a_floor_sees_none_of_it_above_the_horizon():
     across = np.stack(np.meshgrid(*2 * [np.arange(-3, 3, 0.3)]), axis=-1).reshape(-1, 2)
     floor = surfels(np.insert(across, 1, -0.1, axis=1), (0.0, 1, 0), 0.3, one_sided=np.zeros(len(across)))
@@ -114,11 +117,13 @@ def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):
     close(render(None, scene, view).image, found.image, atol=1e-5)  # fresh weights change nothing
 
 
+@pytest.mark.ci
 def test_a_picture_of_an_odd_size_shows_the_ball_at_its_place(scene):
     view = cameras.pinhole(camera(8).cam_to_world, 0.9, 33, 47)
     check_ball(render(None, scene, view), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
 
 
+@pytest.mark.ci
 def test_a_small_ball_in_the_corner_of_a_picture_is_drawn_there(scene):
     view = camera(96, eye=(0.0, 0.0, 4.5), target=(1.1, 1.1, 0.0))
     check_ball(render(None, scene, view), view, 2 * scene.spacing)
@@ -165,6 +170,7 @@ def test_a_plan_of_several_views_holds_each_and_changes_none():
         assert np.asarray(own.acc).max() > 0.9
 
 
+@pytest.mark.ci
 def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wobbled):
     near, wider = camera(96, eye=(0.9, 0.6, 1.0)), 64
     moved = near.intrinsics.at[:2, 2].add(wider)
@@ -186,6 +192,7 @@ def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scen
         assert away > 1 or plan.doublings or plan.width == widest
 
 
+@pytest.mark.ci
 def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh):
     share = 0.75
     view = camera(64)

@@ -64,7 +64,8 @@ def run(points, near):
     return jax.tree.map(np.asarray, (scene, gradients))
 
 
-@pytest.mark.parametrize("given", [pytest.param(False, marks=pytest.mark.ci), True])
+@pytest.mark.ci
+@pytest.mark.parametrize("given", [False, True])
 def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_near(given):
     points = with_normals(ball()) if given else without_normals(ball())
     near = spnr_jax.neighbors(points)
@@ -205,6 +206,7 @@ def count_programs():
     return len(surfel_method._encode.programs) + surfel_method._encode.jitted._cache_size()
 
 
+@pytest.mark.ci
 def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program():
     points = ball()
     centre, scale = normalization(points.positions[points.mask])

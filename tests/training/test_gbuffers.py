@@ -41,6 +41,7 @@ def made(seed, number):
     return gbuffers.make_views(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
 
 
+@pytest.mark.ci
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
     one, two = sorted({view.path for view in tiny_surfels.views()})
     with np.load(one) as file, np.load(two) as other:
@@ -277,6 +278,7 @@ def test_the_loss_is_the_sum_of_its_weighted_errors(crops, params):
     assert terms["opacity_weight"] == pytest.approx(float(metrics["mse_opacity"]))
 
 
+@pytest.mark.ci
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(monkeypatch, tmp_path):
     densified = []
     monkeypatch.setattr(

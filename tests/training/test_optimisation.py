@@ -165,6 +165,7 @@ def test_a_step_is_the_discriminators_update_and_then_the_generators_written_out
     assert all(np.isfinite(value) for value in metrics.values())
 
 
+@pytest.mark.ci
 def test_the_loss_of_the_papers_network_is_that_of_one_forward_in_training_whose_statistics_stay(fresh_l1):
     state, metrics = step(fresh_l1, L1_ONLY)
 

@@ -72,7 +72,7 @@ def test_a_densifier_beside_the_weights_or_in_the_run_comes_before_that_of_the_p
 
 
 def test_a_run_trains_with_the_densifier_of_its_first_weights_or_with_one_that_is_there_and_says_so(tmp_path, capsys):
-    run, trained = tmp_path / "run", weights.read_trained(None)
+    run, trained = tmp_path / "run", weights.read_trained(tiny_surfels.untrained())
     run.mkdir()
     for factor in (2, 2, 3):
         assert not capsys.readouterr().out

@@ -115,6 +115,7 @@ def test_a_change_of_the_light_changes_the_picture():
     np.testing.assert_array_equal(canvas(), before)
 
 
+@pytest.mark.ci
 def test_the_map_stands_behind_the_object_on_the_whole_canvas_where_it_is_asked_for():
     white, lit = (canvas(lighting=Lighting(light="sunset"), background=b) for b in ("white", "light"))
     assert (white[:4, :4] == 255).all()
