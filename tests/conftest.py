@@ -3,7 +3,8 @@
 The hook must be installed before a test module imports spnr_jax; `test_types_are_checked.py` proves that it was.
 Matrix products run in full float32 (a GPU would round them to TF32); on a CPU this changes nothing.  At these sizes a
 test waits for the compiler alone, so XLA's CPU backend optimises as little as it can: 12 instead of 29 seconds for the
-training step.  Nothing but rounding depends on it.  What took long to compile is kept in pytest's own folder, for the
+training step.  Nothing but rounding depends on it.  Each worker compiles on its own core, without source lines in its
+programs: a tenth of the time each.  What took long to compile is kept in pytest's own folder, for the
 other workers and for the next run (JAX_COMPILATION_CACHE_DIR moves it, `-p no:cacheprovider` does without).  Tracing
 makes millions of objects, among which the garbage collector looks less often than it would.
 """
@@ -17,7 +18,9 @@ import jax
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
-QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_COMPILATION = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
 LONG = 0.3  # seconds of a compilation that is kept
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()  # read at the first use
 
@@ -33,6 +36,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_default_matmul_precision", "highest")
+jax.config.update("jax_traceback_in_locations_limit", 0)
 
 
 def pytest_configure(config):

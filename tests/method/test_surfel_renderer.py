@@ -143,6 +143,7 @@ def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_de
     close(other.depth, 2 * np.asarray(one.depth), rtol=1e-5)
 
 
+@pytest.mark.ci
 def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     size = 96
     view = camera(size, eye=(1.2, 0.8, 4.2))
@@ -155,6 +156,7 @@ def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     assert np.abs(one - np.asarray(render(None, scene, view).image)).max() > 0.01
 
 
+@pytest.mark.ci
 def test_a_plan_of_several_views_holds_each_and_changes_none():
     found = surfels(*shape("sphere", 2000))
     scene = SurfelScene(surfels=found, spacing=found.spacing[0], centre=jnp.zeros(3), scale=jnp.ones(()))
@@ -182,7 +184,7 @@ def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wo
         close(own.image, np.asarray(cut.image)[wider:-wider, wider:-wider], atol=most)
 
 
-@pytest.mark.parametrize("size", [31, 96, 160])
+@pytest.mark.parametrize("size", [31, *(pytest.param(size, marks=pytest.mark.ci) for size in (96, 160))])
 def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scene, size):
     for spacing, away in itertools.product((0.02, 0.1, 0.4), (0.9, 2.0, 3.0)):
         other = scene.replace(spacing=jnp.float32(spacing))

@@ -90,6 +90,7 @@ def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_ne
         assert np.mean(off > 1e-3 * max(np.abs(np.float64(values)).max(), 1)) < 0.02, name
 
 
+@pytest.mark.ci
 def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_stack():
     clouds = [ball(0), ball(1)]
     near = [spnr_jax.neighbors(points) for points in clouds]

@@ -52,6 +52,7 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
             assert not np.array_equal(different.get("inputs0"), file["inputs0"])
 
 
+@pytest.mark.ci
 def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
     ball = spiral(800).astype(np.float32)
     flat = {name: np.full(len(ball), 0.5, np.float32) for name in ("roughness", "metallic")}
