@@ -15,6 +15,7 @@ from spnr_jax.method import inference
 from spnr_jax.method.paper_method import render_rays
 from spnr_jax.training import optimisation
 
+pytestmark = pytest.mark.ci
 TOLERANCE = 1e-4
 ARRAYS = twin.load()
 CONFIG = twin.config(ARRAYS)
@@ -102,7 +103,6 @@ def trained():
     return rendering, statistics, parts, gradients
 
 
-@pytest.mark.ci
 def test_images_losses_and_statistics_of_the_training(trained):
     rendering, statistics, losses_of, _ = trained
     agree(rendering.image[:, 0], pictures("train/image"))

@@ -109,6 +109,7 @@ def test_compiled_it_is_what_its_operations_give_one_by_one(params, views, light
     assert np.std(np.asarray(eager.image)) > 0.05
 
 
+@pytest.mark.ci
 def test_what_does_not_fit_into_a_plan_is_counted_and_what_fits_is_whole(scenes, views, lights):
     blend = jax.jit(surfel_renderer.rasterize_window, static_argnames="plan")
     given = scenes[0], views[0], lights[0]

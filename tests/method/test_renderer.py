@@ -159,6 +159,7 @@ class TestJitter:
 
 
 class TestEmptySpace:
+    @pytest.mark.ci
     def test_a_box_that_is_open_everywhere_is_rendered_as_without_skipping_and_so_is_its_gradient(
         self, variables, encoded
     ):

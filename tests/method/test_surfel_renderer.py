@@ -136,6 +136,7 @@ def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
     assert np.all(np.asarray(found.acc) == 0)
 
 
+@pytest.mark.ci
 def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_depths_twice_as_large(scene, fresh):
     one = render(fresh, scene, camera(64))
     other = render(fresh, scene.replace(scale=jnp.float32(0.5)), camera(64, (0, 0, 5.0)))

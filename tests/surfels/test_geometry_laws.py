@@ -101,6 +101,7 @@ def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_s
     close(mapped, jax.tree.map(lambda *x: np.stack(x), *each), rtol=1e-3, atol=2e-3)
 
 
+@pytest.mark.ci
 def test_the_scene_turns_and_moves_and_grows_with_the_cloud_but_for_what_fixed_directions_see():
     points = ball()
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

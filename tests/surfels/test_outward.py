@@ -44,6 +44,7 @@ def test_a_sensor_sees_the_near_cap_of_a_ball_and_nothing_from_the_place_of_the_
     assert measure_spacing(cKDTree(np.zeros((1, 3)))) == 0
 
 
+@pytest.mark.ci
 def test_noise_tilts_normals_less_because_more_points_are_asked():
     points = spiral(8000)
     noise = 0.4 * measure_spacing(cKDTree(points))

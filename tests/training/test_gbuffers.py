@@ -71,6 +71,7 @@ def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
         assert {x.dtype for name, x in vars(cloud).items() if x is not None and name != "mask"} == {np.dtype("f4")}
 
 
+@pytest.mark.ci
 def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_breaks_later_is_named(tmp_path):
     views = tiny_surfels.views()
     folder = shutil.copytree(views[0].path.parent, tmp_path / "gbuffers")
