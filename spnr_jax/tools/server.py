@@ -155,6 +155,7 @@ TITLE = "{}: {:,} points"
 LONGEST_NOTE = 500  # characters
 MOVING_JPEG, RESTING_JPEG = 75, 92  # qualities of the pictures sent
 WIDEST_EXPOSURE = 4.0  # stops
+SETTLED = 0.5  # seconds after which a new page has its size and looks from EYE; before, programs are compiled in vain
 PATIENCE = 1.0  # seconds of drawing after which the page says why it waits
 PREPARING = "Drawing. The first picture of a new size takes longer: its programs are compiled."
 ONE_LIGHT = "This network knows the light of its training alone; `--run surfels` draws in any."
@@ -185,7 +186,7 @@ class Browser:
             self._look(camera)
 
         self._look(client.camera)
-        self.loop.start()
+        threading.Timer(SETTLED, self.loop.start).start()
 
     def _look(self, camera: viser.CameraHandle) -> None:
         view = frame.read_view(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
