@@ -5,7 +5,7 @@
 #   make table1 DATA=DIR BUDGET=quick|tiny|paper TABLE1='--shown 20'    on your data, with more options
 #   make bench               time the network beside a PyTorch twin: runs/bench/table.md (BENCH="--quick")
 #   make test                the everyday suite
-#   make test-ci             what takes minutes more: experiments, wheel, notebooks, kills, many devices
+#   make test-ci             what takes minutes more: whole networks, experiments, wheel, notebooks, kills, many devices
 #   make test-all            these, and what trains for minutes
 #   make check               format, lint, types, tests
 #   make docs                the documents as a site: site/index.html

@@ -17,6 +17,7 @@ from spnr_jax.kernels import losses
 from spnr_jax.kernels.cameras import camera_rays, intersect_box, resize
 from spnr_jax.method import inference
 
+pytestmark = pytest.mark.ci
 MODEL, SIZE, NUM_POINTS = tiny_model.MODEL, tiny_model.SIZE, 32
 RANDOM = 0.6 * np.asarray(numbers(0, NUM_POINTS, 3))
 FIRST = np.arange(NUM_POINTS) == 0

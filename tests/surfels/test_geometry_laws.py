@@ -15,6 +15,7 @@ from spnr_jax.kernels.cloud_arrays import normalization, pad
 from spnr_jax.method import surfel_method, surfel_renderer
 from spnr_jax.surfels.constants import NEIGHBORS
 
+pytestmark = pytest.mark.ci
 COUNT, SIZE = 150, 160  # real points, and with padding
 ball = functools.cache(functools.partial(lumpy_ball, COUNT, SIZE))
 CONSTANT = ("visibility", "one_sided", "mask")  # to gradients
@@ -64,7 +65,6 @@ def run(points, near):
     return jax.tree.map(np.asarray, (scene, gradients))
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize("given", [False, True])
 def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_near(given):
     points = with_normals(ball()) if given else without_normals(ball())
@@ -90,7 +90,6 @@ def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_ne
         assert np.mean(off > 1e-3 * max(np.abs(np.float64(values)).max(), 1)) < 0.02, name
 
 
-@pytest.mark.ci
 def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_stack():
     clouds = [ball(0), ball(1)]
     near = [spnr_jax.neighbors(points) for points in clouds]
@@ -101,7 +100,6 @@ def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_s
     close(mapped, jax.tree.map(lambda *x: np.stack(x), *each), rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.ci
 def test_the_scene_turns_and_moves_and_grows_with_the_cloud_but_for_what_fixed_directions_see():
     points = ball()
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
@@ -208,7 +206,6 @@ def count_programs():
     return len(surfel_method._encode.programs) + surfel_method._encode.jitted._cache_size()
 
 
-@pytest.mark.ci
 def test_the_box_is_that_of_the_handle_and_clouds_of_one_bucket_share_a_program():
     points = ball()
     centre, scale = normalization(points.positions[points.mask])

@@ -27,6 +27,7 @@ from spnr_jax.surfels import lighting
 from spnr_jax.surfels.sides import DIRECTIONS, spiral
 from spnr_jax.training import checkpoint, gbuffers, optimisation, trainer, weights
 
+pytestmark = pytest.mark.ci
 AXES = pytest.mark.parametrize("axis", [0, 1])
 
 
@@ -41,7 +42,6 @@ def made(seed, number):
     return gbuffers.make_views(item, number, LIGHT, dataclasses.replace(CONFIG, seed=seed), {})
 
 
-@pytest.mark.ci
 def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
     one, two = sorted({view.path for view in tiny_surfels.views()})
     with np.load(one) as file, np.load(two) as other:
@@ -52,7 +52,6 @@ def test_a_file_is_what_its_seed_object_and_cloud_make_of_it():
             assert not np.array_equal(different.get("inputs0"), file["inputs0"])
 
 
-@pytest.mark.ci
 def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
     ball = spiral(800).astype(np.float32)
     flat = {name: np.full(len(ball), 0.5, np.float32) for name in ("roughness", "metallic")}
@@ -71,7 +70,6 @@ def test_clouds_have_normals_of_their_file_or_of_all_its_points_or_none():
         assert {x.dtype for name, x in vars(cloud).items() if x is not None and name != "mask"} == {np.dtype("f4")}
 
 
-@pytest.mark.ci
 def test_a_file_cut_off_by_a_crash_is_made_again_and_no_other_one_and_one_that_breaks_later_is_named(tmp_path):
     views = tiny_surfels.views()
     folder = shutil.copytree(views[0].path.parent, tmp_path / "gbuffers")
@@ -280,7 +278,6 @@ def test_the_loss_is_the_sum_of_its_weighted_errors(crops, params):
     assert terms["opacity_weight"] == pytest.approx(float(metrics["mse_opacity"]))
 
 
-@pytest.mark.ci
 def test_a_stopped_run_goes_on_to_the_same_bits_and_rows_from_densified_clouds(monkeypatch, tmp_path):
     densified = []
     monkeypatch.setattr(

@@ -47,6 +47,7 @@ def test_the_network_in_the_package_has_the_weights_and_the_name_of_its_preset(t
     jax.tree.map(np.testing.assert_array_equal, checked.variables["params"], trusted.variables["params"])
 
 
+@pytest.mark.ci
 def test_the_densifier_stands_beside_every_network_over_surfels_and_in_no_file_of_weights(tmp_path):
     trained = weights.read_trained(None)
     weights.write_weights(tmp_path / "w.npz", trained)
