@@ -19,6 +19,7 @@ from spnr_jax.method.surfel_renderer import GRID, Plan, choose_resolution
 from spnr_jax.nn.shader import NUM_FEATURES, Shader
 from spnr_jax.surfels.lighting import light_of
 
+pytestmark = pytest.mark.ci
 CONFIG = SurfelConfig(widths=(8, 8), top=8)
 LIGHT = jax.tree.map(jnp.asarray, light_of(np.full((32, 64, 3), 0.8, np.float32)))
 RADIUS = 0.6
@@ -46,7 +47,6 @@ def wobbled(fresh):
     return jax.tree.unflatten(form, [x + 0.1 * numbers(i, *x.shape) for i, x in enumerate(leaves)])
 
 
-@pytest.mark.ci
 def test_weights_in_bfloat16_have_almost_the_same_outputs(wobbled):
     inputs, network = numbers(3, 1, 8, 8, NUM_FEATURES), Shader(CONFIG.widths, CONFIG.top)
     half, whole = (
@@ -57,7 +57,6 @@ def test_weights_in_bfloat16_have_almost_the_same_outputs(wobbled):
     close(half, whole, atol=0.05 * float(jnp.abs(whole).max()))
 
 
-@pytest.mark.ci
 def test_more_padding_changes_no_surfel_of_a_rod_thinner_than_a_cell_of_the_depth_buffers():
     rod = cloud(shape("rod", 1200)[0] * np.float32([0.02, 0.02, 1]))
     narrow, wider = (encode_in_box(rod, count).surfels for count in (2048, 8192))
@@ -68,7 +67,6 @@ def test_more_padding_changes_no_surfel_of_a_rod_thinner_than_a_cell_of_the_dept
         assert np.mean(change > 1e-3) < 2e-3, name  # by rounding, a point may lie in the next cell
 
 
-@pytest.mark.ci
 def test_an_eye_close_to_a_floor_sees_none_of_it_above_the_horizon():
     across = np.stack(np.meshgrid(*2 * [np.arange(-3, 3, 0.3)]), axis=-1).reshape(-1, 2)
     floor = surfels(np.insert(across, 1, -0.1, axis=1), (0.0, 1, 0), 0.3, one_sided=np.zeros(len(across)))
@@ -117,13 +115,11 @@ def test_a_ball_is_drawn_where_it_is_on_white(scene, fresh):
     close(render(None, scene, view).image, found.image, atol=1e-5)  # fresh weights change nothing
 
 
-@pytest.mark.ci
 def test_a_picture_of_an_odd_size_shows_the_ball_at_its_place(scene):
     view = cameras.pinhole(camera(8).cam_to_world, 0.9, 33, 47)
     check_ball(render(None, scene, view), view, scene.spacing + 2.0 * 2.5 / view.intrinsics[0, 0])
 
 
-@pytest.mark.ci
 def test_a_small_ball_in_the_corner_of_a_picture_is_drawn_there(scene):
     view = camera(96, eye=(0.0, 0.0, 4.5), target=(1.1, 1.1, 0.0))
     check_ball(render(None, scene, view), view, 2 * scene.spacing)
@@ -136,7 +132,6 @@ def test_a_camera_that_looks_away_sees_white(scene, fresh, target):
     assert np.all(np.asarray(found.acc) == 0)
 
 
-@pytest.mark.ci
 def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_depths_twice_as_large(scene, fresh):
     one = render(fresh, scene, camera(64))
     other = render(fresh, scene.replace(scale=jnp.float32(0.5)), camera(64, (0, 0, 5.0)))
@@ -144,7 +139,6 @@ def test_a_cloud_of_twice_the_size_from_twice_as_far_has_the_same_picture_and_de
     close(other.depth, 2 * np.asarray(one.depth), rtol=1e-5)
 
 
-@pytest.mark.ci
 def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     size = 96
     view = camera(size, eye=(1.2, 0.8, 4.2))
@@ -157,7 +151,6 @@ def test_the_picture_moves_with_the_principal_point(scene, wobbled):
     assert np.abs(one - np.asarray(render(None, scene, view).image)).max() > 0.01
 
 
-@pytest.mark.ci
 def test_a_plan_of_several_views_holds_each_and_changes_none():
     found = surfels(*shape("sphere", 2000))
     scene = SurfelScene(surfels=found, spacing=found.spacing[0], centre=jnp.zeros(3), scale=jnp.ones(()))
@@ -173,7 +166,6 @@ def test_a_plan_of_several_views_holds_each_and_changes_none():
         assert np.asarray(own.acc).max() > 0.9
 
 
-@pytest.mark.ci
 def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wobbled):
     near, wider = camera(96, eye=(0.9, 0.6, 1.0)), 64
     moved = near.intrinsics.at[:2, 2].add(wider)
@@ -185,7 +177,7 @@ def test_what_the_border_of_a_picture_cuts_looks_as_in_a_wider_picture(scene, wo
         close(own.image, np.asarray(cut.image)[wider:-wider, wider:-wider], atol=most)
 
 
-@pytest.mark.parametrize("size", [31, *(pytest.param(size, marks=pytest.mark.ci) for size in (96, 160))])
+@pytest.mark.parametrize("size", [31, 96, 160])
 def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scene, size):
     for spacing, away in itertools.product((0.02, 0.1, 0.4), (0.9, 2.0, 3.0)):
         other = scene.replace(spacing=jnp.float32(spacing))
@@ -195,7 +187,6 @@ def test_no_window_is_wider_than_that_of_an_object_that_exceeds_the_picture(scen
         assert away > 1 or plan.doublings or plan.width == widest
 
 
-@pytest.mark.ci
 def test_a_share_of_the_pixels_is_doubled_as_often_and_enlarged_to_nearly_the_same_picture(scene, fresh):
     share = 0.75
     view = camera(64)
