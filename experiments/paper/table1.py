@@ -30,7 +30,7 @@ from experiments.comparison.scores import Scored, score_objects
 from experiments.comparison.study_objects import test_objects
 from experiments.comparison.variants import QUICK_STEPS, Trained, Variant
 from spnr_jax.config import TrainConfig
-from spnr_jax.errors import UserError, require_at_least
+from spnr_jax.errors import UserError, require, require_at_least
 from spnr_jax.formats import data_sets
 from spnr_jax.presets import PRESETS
 from spnr_jax.scoring.report import Cell, Table, number, text
@@ -76,8 +76,7 @@ class Table1:
     """Seed of weights, batches, jitter, and the noise of the Poisson pictures."""
 
     def __post_init__(self) -> None:
-        if not self.methods:
-            raise UserError(f"--methods: name at least one of {', '.join(ROWS)}")
+        require(bool(self.methods), f"--methods: name at least one of {', '.join(ROWS)}")
         require_at_least(self, 1, "objects", "shown")
 
 

@@ -60,7 +60,7 @@ def write_companions(folder: Path, trained: Trained) -> None:
         write_variables(folder / f"{name}.npz", trained.variables[name])
 
 
-def keep_companions(run: Path, trained: Trained, say: Callable[[str], None] = print) -> None:
+def keep_companions(run: Path, trained: Trained, say: Callable[[str], None]) -> None:
     """Writes the network's companions to a run folder, which trains with them.
 
     A file that is there stays; `say` gets a line if it has other weights.
