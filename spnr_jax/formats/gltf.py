@@ -22,6 +22,7 @@ from spnr_jax.formats import assets
 from spnr_jax.formats.assets import RGB, Loading, Material, Part, Texels, Wrap
 from spnr_jax.formats.columns import LONGEST_NAME, Columns
 from spnr_jax.formats.gltf_file import DRACO, MESHOPT, GltfFile
+from spnr_jax.kernels.imaging import srgb_to_linear
 from spnr_jax.kernels.triangles import strip_faces
 
 LOOSE = {"POINTS", "LINES", "LINE_LOOP", "LINE_STRIP"}
@@ -41,6 +42,7 @@ MOTION, SKIN = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1,
 SPECULAR_GLOSSINESS, UNLIT = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit"
 TRANSPARENT = {"transmission": "transmissionFactor", "diffuse_transmission": "diffuseTransmissionFactor"}
 DIELECTRIC = 0.04  # reflectance of a non-metal at normal incidence
+SRGB_WRITERS = ("trimesh", "Open3D")  # write vertex colours as sRGB, where the format has linear ones
 # texels instead of a missing image: grey 0.5; roughness 0.5, metallic 0; specular 0.04, glossiness 0.5; flat
 GREY, DULL, GLOSS, FLAT = (188, 188, 188, 255), (255, 128, 0, 255), (56, 56, 56, 128), (128, 128, 255, 255)
 # Limit of vertices and faces in repeated meshes, because a small file could ask for any number; each repetition costs
@@ -202,6 +204,11 @@ def _shape(file: GltfFile, primitive: dict, mode: str, texcoords: str) -> tuple[
         if counts == {count} and len(kept) < count and 0 <= kept.min(initial=0) <= kept.max(initial=0) < count:
             order, used = places, kept  # the other vertices belong to other primitives
     columns = file.columns(attributes, *wanted, rows=used)
+    generator = str(file.document["asset"].get("generator"))
+    writer = next((name for name in SRGB_WRITERS if name in generator), None)
+    if "COLOR_0" in columns and writer:
+        columns["COLOR_0"][:, :3] = srgb_to_linear(columns["COLOR_0"][:, :3])
+        file.loading.say(f"vertex colours taken as sRGB, as {writer} writes them")
     if mode == "POINTS":
         return {name: values[order] for name, values in columns.items()}, np.zeros((0, 3), np.int64)
     if mode == "TRIANGLE_STRIP":

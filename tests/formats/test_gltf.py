@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 from support.gltf_files import CHECKER, CORNERS, SQUARE, UV, GltfBuilder, instanced, one_square, png, skinned
 from support.mesh_files import glass, painted, refusal, square
 from support.packed_meshes import COLORS, MESHOPT, draco_square, meshopt_files
@@ -284,6 +285,18 @@ def test_colours_on_a_texture_multiply_it_and_for_references_their_mean_does(tmp
     one, other = (points.base_color[points.positions[:, 0] * side < side * 1.5][0] for side in (1, -1))
     np.testing.assert_allclose(other / one, [1, 1, 1] if strict else [0.25, 0.5, 0.75], atol=1e-5)
     assert any("over a texture (their mean is used)" in note for note in asset.ignored) == strict
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points"])
+def test_vertex_colours_that_trimesh_wrote_are_srgb_as_in_its_other_files(tmp_path, kind):
+    colors = np.uint8([[0, 20, 40, 255], [60, 90, 120, 255], [128, 160, 188, 255], [210, 230, 255, 255]])
+    shape = trimesh.PointCloud(CORNERS, colors)
+    if kind == "mesh":
+        shape = trimesh.Trimesh(CORNERS, SQUARE.reshape(-1, 3), vertex_colors=colors, process=False)
+    shape.export(tmp_path / "a.glb")
+    asset = load_mesh(tmp_path / "a.glb", transparent_parts="opaque")
+    np.testing.assert_allclose(asset.parts[0].colors, srgb_to_linear(colors[:, :3] / 255), atol=1e-6)
+    assert "vertex colours taken as sRGB, as trimesh writes them" in asset.notes
 
 
 def test_specular_glossiness_keeps_plain_dielectrics_and_finds_plain_metals():
