@@ -6,6 +6,7 @@ Both halves can be stopped and go on where they were.
 """
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -200,22 +201,22 @@ class Batch(NamedTuple):
     truth: Truth
 
 
-def make_batch(records: list[dict[str, np.ndarray]], rng: np.random.Generator) -> Batch:
+def make_batch(records: list[Path], rng: np.random.Generator) -> Batch:
     """Parts of random clouds until there are as many points as a batch has."""
     parts: list[Batch] = []
     count = 0
     while count < CORE - FEWEST:
-        record = records[rng.integers(len(records))]
-        number = int(rng.choice(int(record["clouds"]), p=OFTEN))
-        part, core = cut(record, number, min(CORE - count, CORE), rng)
+        with np.load(records[rng.integers(len(records))]) as record:  # reads what is asked for: all need 24 MB each
+            number = int(rng.choice(int(record["clouds"]), p=OFTEN))
+            part, core = cut(record, number, min(CORE - count, CORE), rng)
         parts.append(mirror(part) if rng.random() < 0.5 else part)
         count += core
     return join(parts)
 
 
-def cut(record: dict[str, np.ndarray], number: int, most: int, rng: np.random.Generator) -> tuple[Batch, int]:
+def cut(record: Mapping[str, np.ndarray], number: int, most: int, rng: np.random.Generator) -> tuple[Batch, int]:
     """The part of a cloud around a random point that owns at most so many points, and how many those are."""
-    get = {name.removesuffix(str(number)): x for name, x in record.items() if name.endswith(str(number))}
+    get = {name.removesuffix(str(number)): record[name] for name in record if name.endswith(str(number))}
     position, near = get["position"], get["neighbors"]
     count = min(most, len(position))
     core = cKDTree(position).query(position[rng.integers(len(position))], count)[1].reshape(-1)
@@ -370,8 +371,7 @@ def optimizer(options: Options) -> optax.GradientTransformation:
 
 def train(options: Options) -> None:
     """From the checkpoint on; the weights are written beside it."""
-    files = sorted((options.out / "records").glob("*.npz"))
-    records = [read(path) for path in files]
+    records = sorted((options.out / "records").glob("*.npz"))
     print(f"{len(records)} objects", flush=True)
     rule = optimizer(options)
     first = make_batch(records, np.random.default_rng(0))
@@ -381,7 +381,8 @@ def train(options: Options) -> None:
     checkpoint = options.out / "checkpoint.npz"
     if checkpoint.exists():
         leaves, structure = jax.tree.flatten(state)
-        found = read(checkpoint)
+        with checkpoint.open("rb") as file:
+            found = read_arrays(file)
         state = jax.tree.unflatten(structure, [found[f"leaf{i}"] for i in range(len(leaves))])
         print(f"resuming at step {state['step']} of {options.steps}", flush=True)
 
@@ -413,9 +414,3 @@ def describe(steps: list[dict[str, np.ndarray]]) -> str:
     mean = {name: float(np.mean([metrics[name] for metrics in steps])) for name in steps[0]}
     mean |= {name: mean[name] / (mean["kept"] or np.nan) for name in OF_KEPT}
     return " ".join(f"{name} {value:.4f}" for name, value in mean.items())
-
-
-def read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a record or a checkpoint."""
-    with path.open("rb") as file:
-        return read_arrays(file)
