@@ -88,6 +88,7 @@ REFUSED = [  # command, what its line says
     (f"{UNLIT} --turn light", "--turn: the network of --run RUN knows the light"),
     (f"{UNLIT} --exposure 1 --sun 0 9", "--sun, --exposure: the network of --run RUN"),
     ("export ball.xyz --splats out.obj", "out.obj"),
+    ("export a.ply --splats ./a.ply", "a.ply: the cloud itself; choose another file for its splats"),
     ("export ball.xyz --splats out.ply --most-splats 300001", "--most-splats"),
     ("export ball.xyz", "a file; expected a run folder, or of a cloud `spnr export ball.xyz --splats"),
     ("render ball.xyz --sun 40", "see spnr render --help"),

@@ -68,6 +68,13 @@ def camera_rays(camera: Camera) -> Rays:
     return Rays(origins=jnp.broadcast_to(eye, directions.shape), directions=directions)
 
 
+def ray_slopes(
+    intrinsics: Float[AnyArray, "3 3"], column: Float[Array, "*places"], row: Float[Array, "*others"]
+) -> tuple[Float[Array, "*places"], Float[Array, "*others"]]:
+    """How far rays through places of a picture, in pixels, go right and up for each unit ahead; not batched."""
+    return (column - intrinsics[0, 2]) / intrinsics[0, 0], -(row - intrinsics[1, 2]) / intrinsics[1, 1]
+
+
 def view_rays(camera: Camera) -> Rays:
     """Rays of all views of an object in one axis, (objects, views * height * width, 3)."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 3), camera_rays(camera))

@@ -132,13 +132,16 @@ def with_gradient(function: Callable, pull_back: Callable) -> Callable:
     """The function with a given vector-Jacobian product that also works in forward mode.
 
     `pull_back(primals, cotangents)` is linear in the cotangents, a tuple like the outputs.  The JVP is its transpose;
-    reverse mode transposes that again, which restores `pull_back`.
+    reverse mode transposes that again, which restores `pull_back`.  Primals may be of float32 and float64.
     """
     differentiable = jax.custom_jvp(function)
 
     def pushed_forward(primals: tuple, tangents: tuple) -> tuple:
+        def pull(*cotangents: Array) -> tuple:
+            return jax.tree.map(lambda by, x: by.astype(x.dtype), pull_back(primals, cotangents), primals)
+
         out = differentiable(*primals)
-        return out, jax.linear_transpose(lambda *given: pull_back(primals, given), *out)(tangents)
+        return out, jax.linear_transpose(pull, *out)(tangents)
 
     differentiable.defjvp(pushed_forward)
     return differentiable
@@ -264,7 +267,7 @@ def _largest_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
     (values,), (change,) = primals, tangents
     most = largest(values)
     near = values >= (most - 8 * jnp.finfo(values.dtype).eps * jnp.abs(most))[None]
-    share = near / jnp.maximum(jnp.sum(near, axis=0, dtype=values.dtype), 1)[None]
+    share = near.astype(values.dtype) / jnp.maximum(jnp.sum(near, axis=0, dtype=values.dtype), 1)[None]
     return most, jnp.sum(share * change, axis=0)
 
 

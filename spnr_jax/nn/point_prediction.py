@@ -138,8 +138,8 @@ def convolve(params: dict, hidden: Array, edges: Array, around: Array, exists: A
 
 def pool(values: Float[Array, "m k f"], real: Bool[Array, "m k"]) -> Float[Array, "m 2*f"]:
     """Maximum (of values above 0) and mean over the entries that are real."""
-    values = values * real[..., None]
-    mean = jnp.sum(values, axis=1) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True), 1)
+    values = jnp.where(real[..., None], values, 0)
+    mean = jnp.sum(values, axis=1) / jnp.maximum(jnp.sum(real, axis=1, keepdims=True, dtype=values.dtype), 1)
     return jnp.concatenate([jnp.max(values, axis=1), mean], axis=1)
 
 
@@ -176,7 +176,7 @@ def describe_points(nodes: Nodes, candidates: Candidates) -> tuple[Float[Array, 
     far = length(offset)
     color = (nodes.color[candidates.first] + nodes.color[candidates.second]) / 2
     unlike = length(nodes.color[number] - color[:, None])
-    ends = [number == x[:, None] for x in (candidates.first, candidates.second)]
+    ends = [(number == x[:, None]).astype(far.dtype) for x in (candidates.first, candidates.second)]
     coarse = jnp.log(nodes.spacing[number] / scale)
     height = -jnp.sum(offset * normal, axis=-1)
     parts = [far, jnp.exp(-(far**2)), height, coarse, unlike, jnp.exp(-8 * unlike), *ends]

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
+from spnr_jax.kernels.cameras import ray_slopes
 from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep
 from spnr_jax.kernels.records import Camera, GBuffer, Surfels
 from spnr_jax.surfels.splatting import Entries, Footprints
@@ -60,8 +61,8 @@ def blend(
     has_color = sharp > LEAST_WEIGHT
     known_sharp = jnp.where(has_color, sharp, 1)
     ahead = jnp.sum(sharp_weight * depth, axis=0) / known_sharp
-    color, centre = jnp.split(_sum_colors(sharp_weight, point, narrow, pixel_of, ahead, camera), (3,), axis=1)
-    pixel_centre = jnp.stack([pixel_of % camera.width, pixel_of // camera.width], axis=-1) + 0.5
+    pixel = jnp.stack([pixel_of % camera.width, pixel_of // camera.width], axis=-1).astype(depth.dtype) + 0.5
+    color, centre = jnp.split(_sum_colors(sharp_weight, point, narrow, pixel, ahead, camera), (3,), axis=1)
     features = attributes.shape[1]
     of_slots = GBuffer(
         opacity=smaller(opacity, 1),
@@ -73,7 +74,7 @@ def blend(
         color=color * jnp.where(has_color, 1 / known_sharp, 0)[:, None],
         attributes=means[:, :features],
         sharp_weight=sharp,
-        centre_offset=(centre - sharp[:, None] * pixel_centre) / (sharp + FADE)[:, None],
+        centre_offset=(centre - sharp[:, None] * pixel) / (sharp + FADE)[:, None],
     )
     return _place_in_picture(of_slots, pixel_of, camera)
 
@@ -133,24 +134,23 @@ def _sum_colors(
     sharp_weight: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
     rows: Float[Array, "points 12"],
-    pixel_of: Int[Array, " slots"],
+    pixel: Float[Array, "slots 2"],
     ahead: Float[Array, " slots"],
     camera: Camera,
 ) -> Float[Array, "slots 5"]:
     """Weighted sums of the discs' colours where the ray meets the surface, and of the discs' centres.
 
-    Rows: the 10 columns of `_gather_colors`, then column and row of the disc's centre in pixels.  A color edge is
-    antialiased over one pixel.
+    Rows: the 10 columns of `_gather_colors`, then column and row of the disc's centre in pixels, as `pixel` has them
+    of the slot.  A color edge is antialiased over one pixel.
     """
-    right = ahead * ((pixel_of % camera.width + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0])
-    up = ahead * -((pixel_of // camera.width + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1])
-    pose, pixel = camera.cam_to_world, larger(ahead, 1e-6) / camera.intrinsics[0, 0]
+    right, up = (ahead * slope for slope in ray_slopes(camera.intrinsics, *pixel.T))
+    pose, width = camera.cam_to_world, larger(ahead, 1e-6) / camera.intrinsics[0, 0]
     where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
     def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
         color, across, border, jump, centre = jnp.split(rows[at[1]], (3, 6, 7, 10), axis=1)
         beyond = sum(across[:, i] * where[i] for i in range(3)) - border[:, 0]
-        color += clamp(0.5 + beyond / pixel, 0, 1)[:, None] * jump
+        color += clamp(0.5 + beyond / width, 0, 1)[:, None] * jump
         return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
 
     return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp_weight, point), unroll=8)[0]
@@ -198,7 +198,7 @@ def _pull_back_blend_weights(
     by_group = by_weight * (tau * transmittance * slope)
     by_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
     by_tau = by_weight * (transmittance * mean) + by_group
-    by_tau += jnp.matmul(_far_in_front(len(tau)).T, by_before, precision="highest")
+    by_tau += jnp.matmul(_far_in_front(tau).T, by_before, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
     by_group, by_before = map(jax.lax.optimization_barrier, (by_group, by_before))  # one would be linear in all
     known = tau, depth, spacing, by_group, by_before
@@ -209,7 +209,7 @@ def _pull_back_blend_weights(
         by_tau += other_by_group * (1 - apart) + (other_by_before * apart if step > 0 else 0)
         through = tau * other_by_before if step > 0 else other_tau * by_before  # the front entry occludes the other
         by_gap = slope * (through - other_tau * by_group - tau * other_by_group)
-        by_depth += np.sign(-step) * by_gap / middle
+        by_depth += by_gap / middle if step < 0 else -by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
     return by_tau, by_depth, by_spacing
 
@@ -219,7 +219,7 @@ compute_blend_weights = jax.checkpoint(numerics.with_gradient(_blend_weights, _p
 
 def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
     """Optical depth in front of each entry's group, and that of the group."""
-    tau_before, tau_group = jnp.matmul(_far_in_front(len(tau)).astype(tau.dtype), tau, precision="highest"), tau
+    tau_before, tau_group = jnp.matmul(_far_in_front(tau), tau, precision="highest"), tau
     for step, (other_tau, *places) in _shift_lists((tau, depth, spacing), (0.0, 0.0, 1.0)):
         apart = smoothstep(_measure_gap(step, depth, spacing, *places)[0] - 1)
         tau_group += other_tau * (1 - apart)
@@ -228,9 +228,9 @@ def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Ar
     return tau_before, tau_group
 
 
-def _far_in_front(length: int) -> Array:
+def _far_in_front(lists: Array) -> Array:
     """1 where the column's entry is so far in front of the row's entry in the list that it occludes it untested."""
-    return jnp.tril(jnp.ones((length, length)), -COMPARED - 1)
+    return jnp.tril(jnp.ones((len(lists), len(lists)), lists.dtype), -COMPARED - 1)
 
 
 def _shift_lists(
@@ -250,7 +250,7 @@ def _measure_gap(
 ) -> tuple[Array, Array]:
     """Distance in depth between two entries in spacings, and the mean of their spacings."""
     middle = 0.5 * (spacing + other_spacing)
-    return np.sign(-step) * (depth - other_depth) / middle, middle
+    return (depth - other_depth if step < 0 else other_depth - depth) / middle, middle
 
 
 def _mean_transmittance(tau: Array) -> tuple[Array, Array]:

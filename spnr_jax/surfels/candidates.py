@@ -97,8 +97,8 @@ def describe_pairs(nodes: Nodes, neighbors: Int[Array, "n 20"]) -> Pairs:
     crosses_wall = (jnp.abs(height) > ACROSS * size) & (jnp.abs(height_there) > ACROSS * size)
     cosine = jnp.sum(nodes.normal[:, None] * nodes.normal[other], axis=-1)
     bent = (jnp.abs(height) + jnp.abs(height_there)) / spacing + 1 - cosine > BENT
-    opposed = jnp.sum(real & (cosine < OPPOSED_COSINE), axis=1)
-    on_wall = opposed > WALL_SHARE * jnp.sum(real, axis=1)  # pairs across a wall would fill one side of it alone
+    opposed, near = (jnp.sum(x, axis=1, dtype=size.dtype) for x in (real & (cosine < OPPOSED_COSINE), real))
+    on_wall = opposed > WALL_SHARE * near  # pairs across a wall would fill one side of it alone
     bent = bent | on_wall[:, None] | on_wall[other]
     tangent = normalize((offset - height[..., None] * nodes.normal[:, None]) / spacing[..., None])
     return Pairs(other, real, offset, size, tangent, crosses_wall, bent)

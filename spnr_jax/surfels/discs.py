@@ -198,7 +198,7 @@ def find_color_edge(
     beyond = _split_colors(weight, jax.lax.stop_gradient(roots))
     plane = jnp.concatenate([jnp.ones_like(uv[:, :1]), uv], axis=1)
     products = jnp.stack([uv[:, 0] ** 2, uv[:, 0] * uv[:, 1], uv[:, 1] ** 2], axis=1)
-    groups = jnp.stack([weight * ~beyond, weight * beyond], axis=1)
+    groups = jnp.stack([jnp.where(beyond, 0, weight), jnp.where(beyond, weight, 0)], axis=1)
     spread = jnp.sum(roots**2, axis=1)[:, None]
     own, other = sum_products(groups, jnp.concatenate([plane, products, change, roots, spread], axis=1))
     direction, distance, wrong = _find_line(uv, weight, beyond, own, other)
@@ -260,7 +260,7 @@ def _find_line(
     first = smallest(jnp.where(there & beyond, height, jnp.inf))
     some = first < jnp.inf
     distance = larger(jnp.where(some, last + jnp.where(some, first, 0), 0) / 2, 0)
-    return direction, distance, sum_first(weight * (beyond != (height > distance[None])))
+    return direction, distance, sum_first(jnp.where(beyond != (height > distance[None]), weight, 0))
 
 
 def _mean(sums: Float[Array, "sums block"], columns: slice) -> Float[Array, "columns block"]:

@@ -222,7 +222,8 @@ def fit_layers(
         fit_slopes = jnp.where(with_step, 1, free)
 
         def fit_quadric() -> QuadricFit:
-            return _fit_quadric(offset, weight, initial, with_step * color_distance, least_thickness, fit_slopes)
+            step = jnp.where(with_step, color_distance, 0)
+            return _fit_quadric(offset, weight, initial, step, least_thickness, fit_slopes)
 
         found = jax.lax.cond(~with_step | jnp.any(two_colors), fit_quadric, lambda: initial)
         return found.layer.normal, found

@@ -105,7 +105,8 @@ def measure_evenness(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -
     xp = array_namespace(cloud.positions, neighbors)
     mask = xp.asarray(cloud.mask)
     if cloud.evenness is not None:
-        return xp.asarray(xp.sum(xp.where(mask, xp.asarray(cloud.evenness), 0)) / xp.maximum(xp.sum(mask), 1))
+        given = xp.where(mask, xp.asarray(cloud.evenness), 0)
+        return xp.asarray(xp.sum(given) / xp.maximum(xp.sum(mask, dtype=given.dtype), 1))
     near = xp.asarray(neighbors)[:, 1:7]
     real = (near >= 0) & mask[:, None]
 
@@ -116,7 +117,7 @@ def measure_evenness(cloud: PointCloud, neighbors: Int[AnyArray, "points 20"]) -
         return xp.where(values > 0, xp.sqrt(xp.where(values > 0, values, 1)), 0)
 
     def mean(values: AnyArray) -> AnyArray:
-        return xp.sum(values, axis=1) / xp.maximum(xp.sum(real, axis=1), 1)
+        return xp.sum(values, axis=1) / xp.maximum(xp.sum(real, axis=1, dtype=values.dtype), 1)
 
     squared = squares(xp.asarray(cloud.positions))
     if cloud.normals is not None:

@@ -54,7 +54,7 @@ def choose_grid(count: int | Int[Array, ""]) -> Any:
 
 def choose_cell(spacing: Float[Array, ""], count: Int[Array, ""]) -> Float[Array, ""]:
     """Width of a cell, from the median spacing and the number of points, padding not counted."""
-    return jnp.maximum(CELL * spacing, BOX / choose_grid(count))
+    return jnp.maximum(CELL * spacing, BOX / choose_grid(count).astype(spacing.dtype))
 
 
 def compute_visibility(
@@ -86,7 +86,8 @@ def compute_visibility(
 
         def depth_at(cells, place, depth):
             """Depth of the points' planes at the centres of cells."""
-            return depth + cell * sum((c + 0.5 - x) * slope for c, x, slope in zip(cells, place, slopes, strict=True))
+            steps = (c.astype(depth.dtype) + 0.5 - x for c, x in zip(cells, place, strict=True))
+            return depth + cell * sum(step * slope for step, slope in zip(steps, slopes, strict=True))
 
         def number(cells):
             column, row = (jnp.clip(c + grid // 2, 0, grid - 1) for c in cells)
@@ -153,13 +154,13 @@ def vote_by_thin_walls(
     """
     cosine = project_on(normals, layer.normal)
     other = jnp.where(oriented[None], -cosine, jnp.abs(cosine)) > CONSTANTS.parallel_cosine
-    wall = weigh_distance(hood, spacing) * other * (jnp.abs(layer.height) < CONSTANTS.thin_wall_height)
+    wall = jnp.where(other & (jnp.abs(layer.height) < CONSTANTS.thin_wall_height), weigh_distance(hood, spacing), 0)
     thin = oriented & (layer.thickness <= CONSTANTS.thickness_bounds[0])
     thickness = jnp.where(thin, CONSTANTS.split_thickness, layer.thickness)
     outward = layer.height / thickness[None]
     above, below = (
-        sum_first(wall * (outward > CONSTANTS.other_layer)),
-        sum_first(wall * (outward < -CONSTANTS.other_layer)),
+        sum_first(jnp.where(outward > CONSTANTS.other_layer, wall, 0)),
+        sum_first(jnp.where(outward < -CONSTANTS.other_layer, wall, 0)),
     )
     return CONSTANTS.thin_wall_weight * (below - above) / (above + below + CONSTANTS.vote_ridge)
 
@@ -175,5 +176,5 @@ def orient_normals(
     """
     begin, end = CONSTANTS.orientation_ramp
     one_sided = clamp((jnp.abs(vote) - begin) / (end - begin), 0, 1 - CONSTANTS.back_weight)
-    wrong = vote < jnp.where(oriented, -CONSTANTS.flip_vote, 0)
+    wrong = vote < jnp.where(oriented, -CONSTANTS.flip_vote, 0.0)
     return jnp.where(wrong[None], -normal, normal), jax.lax.stop_gradient(one_sided)

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from spnr_jax.kernels.cameras import ray_slopes
 from spnr_jax.kernels.numerics import (
     clamp,
     cross,
@@ -154,8 +155,8 @@ def move_to_window(foot: Footprints, corner: Int[Array, "2"], width: int, height
     left, right = (jnp.clip(x - corner[0], 0, width) for x in (foot.left, foot.left + foot.width))
     top, bottom = (jnp.clip(x - corner[1], 0, height) for x in (foot.top, foot.top + rows))
     return foot._replace(
-        column=foot.column - corner[0],
-        row=foot.row - corner[1],
+        column=foot.column - corner[0].astype(foot.column.dtype),
+        row=foot.row - corner[1].astype(foot.row.dtype),
         left=left,
         top=top,
         width=jnp.maximum(right - left, 1),
@@ -222,8 +223,8 @@ def evaluate_kernels(
     )
     (x, y, z), (nx, ny, nz), rim, side, rim_distances = gathered
     radius = foot.radius[point]
-    right = (column + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
-    up = -(row + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    across, down = (x.astype(radius.dtype) + 0.5 for x in (column, row))
+    right, up = ray_slopes(intrinsics, across, down)
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, smaller(slope, -LEAST_COSINE), larger(slope, LEAST_COSINE))
     ray_depth = (nx * x + ny * y + nz * z) / slope
@@ -234,7 +235,7 @@ def evaluate_kernels(
     along, across = dot(offset, rim), dot(offset, side)
     ends = [r - x for r, x in zip(rim_distances, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
-    on_picture = ((column + 0.5 - foot.column[point]) ** 2 + (row + 0.5 - foot.row[point]) ** 2) / MIN_RADIUS**2
+    on_picture = ((across - foot.column[point]) ** 2 + (down - foot.row[point]) ** 2) / MIN_RADIUS**2
     cut = jnp.where(ahead, larger(cut - in_plane, RIM_SKIRT * (1 - in_plane)), 0)
     return clamp(larger(cut, 1 - on_picture), 0, 1), clamp(ray_depth, -z - radius, -z + radius)
 

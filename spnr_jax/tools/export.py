@@ -74,6 +74,8 @@ def export_object(options: Export, note: Say) -> str:
     render_options = make_render_options(options, options.run, options.network)
     assert options.splats is not None
     check_suffix(options.splats)
+    if options.splats.resolve() == render_options.cloud.resolve():
+        raise UserError(f"{options.splats}: the cloud itself; choose another file for its splats")
     gaussians = _splats(prepare_cloud(render_options, note), options, note)
     size = write_splats(options.splats, gaussians, describe_source(render_options))
     return f"wrote {options.splats} ({len(gaussians.opacity):,} splats, {size / 1e6:.1f} MB)"

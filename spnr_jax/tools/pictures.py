@@ -142,9 +142,12 @@ def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Cal
     views = (put_background(options.background, rendering, camera, light) for camera, light, rendering in drawn)
     for i, (camera, rendering) in enumerate(zip(stills, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", rendering, camera, ready.volume, options)
-    if stills:
+    file = Path(f"{name}_cameras.json")
+    if stills and not (
+        options.cameras and options.cameras.resolve() == file.resolve()
+    ):  # what was given stays as it is
         document = cameras_document(stills, name.name, ready.placed, ready.volume)
-        images.write_whole(Path(f"{name}_cameras.json"), f"{json.dumps(document, indent=1)}\n".encode())
+        images.write_whole(file, f"{json.dumps(document, indent=1)}\n".encode())
     if options.turntable != "none":
         film = [np.asarray(rendering.image) for rendering in views]
         yield partial(_write_film, Path(f"{name}_turntable.{options.turntable}"), film, options)

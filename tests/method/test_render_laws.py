@@ -13,11 +13,14 @@ from spnr_jax.config import SurfelConfig
 from spnr_jax.kernels import cloud_arrays
 from spnr_jax.kernels.records import Rendering
 from spnr_jax.method import surfel_method, surfel_renderer
+from spnr_jax.method.densifier import densify
 from spnr_jax.method.surfel_method import encode_in_box
 from spnr_jax.method.surfel_renderer import Plan, encode, plan, render
+from spnr_jax.surfels.candidates import CANDIDATES
 from spnr_jax.surfels.lighting import room_light
 from spnr_jax.surfels.neighbors import neighbors
 from spnr_jax.surfels.skies import sun
+from spnr_jax.training.weights import load
 
 CONFIG = SurfelConfig(widths=(4, 6), top=4)
 EYES = (0.3, 0.4, 2.4), (1.5, 1.0, 1.5)
@@ -158,6 +161,25 @@ def test_nothing_traced_leaves_encode_and_padded_clouds_can_be_traced():
     with jax.checking_leaks():
         made = jax.eval_shape(lambda points: encode(None, cloud_arrays.pad(points, 128), near), points)
     assert made.surfels.mask.shape == (128,)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("context", [jax.numpy_dtype_promotion("strict"), jax.enable_x64(True)], ids=["strict", "x64"])
+def test_gradients_in_strict_promotion_and_by_a_camera_of_float64(lights, context):
+    points, params = cloud(shape("sphere", 90)[0]), load().params
+    near = neighbors(points)
+    of_dense = np.tile(near, (1 + CANDIDATES, 1))
+
+    def loss(position, pose):
+        dense = densify(params, points.replace(positions=position), near)
+        seen = view().replace(cam_to_world=pose)
+        return jnp.mean(render(params, encode(params, dense, of_dense), seen, lights[0], plan=ROOM).image)
+
+    with context:
+        pose = jnp.asarray(np.float64(view().cam_to_world))
+        by_position, by_pose = jax.eval_shape(jax.grad(loss, (0, 1)), jnp.asarray(points.positions), pose)
+    assert by_position.dtype == jnp.float32
+    assert by_pose.dtype == pose.dtype
 
 
 def test_order_and_padding_of_the_points_do_not_matter(params, scenes, views, lights):

@@ -81,6 +81,10 @@ def test_the_cameras_that_were_written_draw_the_same_stills_again(tmp_path):
     assert names(tmp_path / "b") == STILLS | {"chair_turntable.gif"}
     for name in sorted(STILLS):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    own = json.loads(written.read_text()) | {"more": "of its owner"}
+    written.write_text(json.dumps(own))
+    list(pictures.render_file(dataclasses.replace(again, out=tmp_path / "a", turntable="none"), lambda line: None))
+    assert json.loads(written.read_text()) == own, "the cameras that are read stay as they are"
     with pytest.raises(ValueError, match="--views: not together with --cameras"):
         dataclasses.replace(again, views=2)
     written.write_text("{}")
