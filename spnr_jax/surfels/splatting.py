@@ -223,8 +223,8 @@ def evaluate_kernels(
     )
     (x, y, z), (nx, ny, nz), rim, side, rim_distances = gathered
     radius = foot.radius[point]
-    across, down = (x.astype(radius.dtype) + 0.5 for x in (column, row))
-    right, up = ray_slopes(intrinsics, across, down)
+    column_centre, row_centre = (x.astype(radius.dtype) + 0.5 for x in (column, row))
+    right, up = ray_slopes(intrinsics, column_centre, row_centre)
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, smaller(slope, -LEAST_COSINE), larger(slope, LEAST_COSINE))
     ray_depth = (nx * x + ny * y + nz * z) / slope
@@ -235,7 +235,8 @@ def evaluate_kernels(
     along, across = dot(offset, rim), dot(offset, side)
     ends = [r - x for r, x in zip(rim_distances, (along, -along, across, -across), strict=True)]
     cut = reduce(mul, (clamp(0.5 + end / RIM_WIDTH, 0, 1) for end in ends))
-    on_picture = ((across - foot.column[point]) ** 2 + (down - foot.row[point]) ** 2) / MIN_RADIUS**2
+    beside = (column_centre - foot.column[point]) ** 2 + (row_centre - foot.row[point]) ** 2
+    on_picture = beside / MIN_RADIUS**2
     cut = jnp.where(ahead, larger(cut - in_plane, RIM_SKIRT * (1 - in_plane)), 0)
     return clamp(larger(cut, 1 - on_picture), 0, 1), clamp(ray_depth, -z - radius, -z + radius)
 

@@ -143,9 +143,7 @@ def draw_all(ready: PreparedObject, options: Render, name: Path) -> Iterator[Cal
     for i, (camera, rendering) in enumerate(zip(stills, views, strict=False)):  # the rest are the film's
         yield partial(_write_still, f"{name}_{i:03d}", rendering, camera, ready.volume, options)
     file = Path(f"{name}_cameras.json")
-    if stills and not (
-        options.cameras and options.cameras.resolve() == file.resolve()
-    ):  # what was given stays as it is
+    if stills and not (options.cameras and options.cameras.resolve() == file.resolve()):  # it stays as it is
         document = cameras_document(stills, name.name, ready.placed, ready.volume)
         images.write_whole(file, f"{json.dumps(document, indent=1)}\n".encode())
     if options.turntable != "none":
