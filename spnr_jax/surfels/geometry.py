@@ -122,6 +122,11 @@ def map_blocks(
     forms: list[Any] = []  # structure of the results, known once `compute` is traced: lax.cond traces it before `skip`
 
     def compute(neighbors: Array, packed: Array) -> Array:
+        real = (
+            neighbors[0] >= 0
+        )  # padding repeats a real point: a NaN there would reach the gradient of the first point
+        first = jnp.argmax(real)
+        neighbors, packed = (jnp.where(real, x, jnp.take(x, first, axis=1)[:, None]) for x in (neighbors, packed))
         positions, values = _unpack(packed, (points.position, own))
         out = work(layers.gather_neighborhoods(neighbors, positions, table), *values)
         forms.append(jax.eval_shape(lambda: out))  # no traced values: they must not leave the function

@@ -13,6 +13,7 @@ from support.surfel_clouds import cloud, lumpy_ball, shape
 import spnr_jax
 from spnr_jax.kernels.cloud_arrays import normalization, pad
 from spnr_jax.method import surfel_method, surfel_renderer
+from spnr_jax.surfels import geometry
 from spnr_jax.surfels.constants import NEIGHBORS
 
 pytestmark = pytest.mark.ci
@@ -88,6 +89,16 @@ def test_gradients_are_those_of_central_differences_in_float64_and_float32_is_ne
     for name, values in vars(double.surfels).items():
         off = np.abs(np.float64(getattr(single.surfels, name)) - np.float64(values)).reshape(SIZE, -1).max(axis=1)
         assert np.mean(off > 1e-3 * max(np.abs(np.float64(values)).max(), 1)) < 0.02, name
+
+
+def test_blocks_of_points_and_the_padding_of_the_last_one_change_no_gradient(monkeypatch):
+    points = with_normals(ball())
+    near = spnr_jax.neighbors(points)
+    one = run(points, near)
+    monkeypatch.setattr(geometry, "CONSTANTS", dataclasses.replace(geometry.CONSTANTS, block_size=64))
+    in_blocks = jax.jit(jax.value_and_grad(projection, has_aux=True))
+    (_, scene), gradients = in_blocks(columns_of(points), jax.tree.map(jnp.asarray, points), jnp.asarray(near))
+    close((scene.surfels, gradients), (one[0].surfels, one[1]), rtol=1e-3, atol=2e-3)
 
 
 def test_clouds_of_equal_padding_are_mapped_as_they_are_encoded_one_by_one_and_stack():
