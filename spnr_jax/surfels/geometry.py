@@ -122,10 +122,8 @@ def map_blocks(
     forms: list[Any] = []  # structure of the results, known once `compute` is traced: lax.cond traces it before `skip`
 
     def compute(neighbors: Array, packed: Array) -> Array:
-        real = (
-            neighbors[0] >= 0
-        )  # padding repeats a real point: a NaN there would reach the gradient of the first point
-        first = jnp.argmax(real)
+        real = neighbors[0] >= 0
+        first = jnp.argmax(real)  # padding repeats this point: NaN there would reach the gradient of the cloud's first
         neighbors, packed = (jnp.where(real, x, jnp.take(x, first, axis=1)[:, None]) for x in (neighbors, packed))
         positions, values = _unpack(packed, (points.position, own))
         out = work(layers.gather_neighborhoods(neighbors, positions, table), *values)
