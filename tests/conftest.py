@@ -15,6 +15,7 @@ import signal
 from pathlib import Path
 
 import jax
+import pytest
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
@@ -37,6 +38,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_default_matmul_precision", "highest")
 jax.config.update("jax_traceback_in_locations_limit", 0)
+
+
+@pytest.fixture(autouse=True)
+def _obey_ctrl_c():
+    """A command that another test ran to its end in this process may have left its own answer to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config):
