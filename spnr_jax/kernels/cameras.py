@@ -68,7 +68,7 @@ def camera_rays(camera: Camera) -> Rays:
     return Rays(origins=jnp.broadcast_to(eye, directions.shape), directions=directions)
 
 
-def ray_slopes(
+def compute_ray_slopes(
     intrinsics: Float[AnyArray, "3 3"], column: Float[Array, "*places"], row: Float[Array, "*others"]
 ) -> tuple[Float[Array, "*places"], Float[Array, "*others"]]:
     """How far rays through places of a picture, in pixels, go right and up for each unit ahead; not batched."""

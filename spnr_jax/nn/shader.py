@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spnr_jax.kernels.cameras import ray_slopes
+from spnr_jax.kernels.cameras import compute_ray_slopes
 from spnr_jax.kernels.imaging import average_pool, depth_to_space, double_size, linear_to_srgb, remove_checkerboard
 from spnr_jax.kernels.numerics import (
     clamp,
@@ -192,7 +192,7 @@ def _directions(buffer: GBuffer, camera: Camera) -> tuple[list[Array], list[Arra
     normal = [n / larger(size, 1e-4) for n in split_columns(buffer.normal)]
     normal = [jnp.where(known, n, c) for n, c in zip(normal, (0.0, 0.0, 1.0), strict=True)]
     across, down = (jnp.arange(n, dtype=size.dtype) + 0.5 for n in (camera.width, camera.height))
-    right, up = jnp.broadcast_arrays(*ray_slopes(camera.intrinsics, across[None], down[:, None]))
+    right, up = jnp.broadcast_arrays(*compute_ray_slopes(camera.intrinsics, across[None], down[:, None]))
     length = jnp.sqrt(right**2 + up**2 + 1)
     return normal, [right / length, up / length, -1 / length]
 

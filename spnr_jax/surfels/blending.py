@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spnr_jax.kernels import numerics
-from spnr_jax.kernels.cameras import ray_slopes
+from spnr_jax.kernels.cameras import compute_ray_slopes
 from spnr_jax.kernels.numerics import clamp, larger, one_minus_exp, safe_sqrt, smaller, smoothstep
 from spnr_jax.kernels.records import Camera, GBuffer, Surfels
 from spnr_jax.surfels.splatting import Entries, Footprints
@@ -143,7 +143,7 @@ def _sum_colors(
     Rows: the 10 columns of `_gather_colors`, then column and row of the disc's centre in pixels, as `pixel` has them
     of the slot.  A color edge is antialiased over one pixel.
     """
-    right, up = (ahead * slope for slope in ray_slopes(camera.intrinsics, *pixel.T))
+    right, up = (ahead * slope for slope in compute_ray_slopes(camera.intrinsics, *pixel.T))
     pose, width = camera.cam_to_world, larger(ahead, 1e-6) / camera.intrinsics[0, 0]
     where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 

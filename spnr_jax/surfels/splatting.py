@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from spnr_jax.kernels.cameras import ray_slopes
+from spnr_jax.kernels.cameras import compute_ray_slopes
 from spnr_jax.kernels.numerics import (
     clamp,
     cross,
@@ -224,7 +224,7 @@ def evaluate_kernels(
     (x, y, z), (nx, ny, nz), rim, side, rim_distances = gathered
     radius = foot.radius[point]
     column_centre, row_centre = (x.astype(radius.dtype) + 0.5 for x in (column, row))
-    right, up = ray_slopes(intrinsics, column_centre, row_centre)
+    right, up = compute_ray_slopes(intrinsics, column_centre, row_centre)
     slope = nx * right + ny * up - nz
     slope = jnp.where(slope < 0, smaller(slope, -LEAST_COSINE), larger(slope, LEAST_COSINE))
     ray_depth = (nx * x + ny * y + nz * z) / slope

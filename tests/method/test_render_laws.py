@@ -172,11 +172,11 @@ def test_gradients_in_strict_promotion_and_by_a_camera_of_float64(lights, contex
 
     def loss(position, pose):
         dense = densify(params, points.replace(positions=position), near)
-        seen = view().replace(cam_to_world=pose)
+        seen = view().replace(cam_to_world=pose, intrinsics=lens)
         return jnp.mean(render(params, encode(params, dense, of_dense), seen, lights[0], plan=ROOM).image)
 
     with context:
-        pose = jnp.asarray(np.float64(view().cam_to_world))
+        pose, lens = (jnp.asarray(np.float64(x)) for x in (view().cam_to_world, view().intrinsics))
         by_position, by_pose = jax.eval_shape(jax.grad(loss, (0, 1)), jnp.asarray(points.positions), pose)
     assert by_position.dtype == jnp.float32
     assert by_pose.dtype == pose.dtype
