@@ -27,7 +27,7 @@ NUM_NEAREST = 16  # nearest points from which a point is predicted
 BETWEEN = 0.4  # a point lies between two ends if the cosine of the angle at which it sees them is below -BETWEEN
 ACROSS = 0.8  # sine of the angle between a pair and both tangent planes, above which the pair crosses a wall
 LONGEST, SHORTEST = 4.0, 0.3  # bounds of a pair's length, in spacings
-ANGLES = 2 * np.pi / 6 * np.arange(6)  # of the directions tested for openness, from that to the nearest neighbor
+ANGLES = np.linspace(0, 2 * np.pi, 6, endpoint=False, dtype=np.float32)  # tested for openness, from the nearest
 BESIDE, NEAR = 0.75, 1.7  # a neighbor closes a direction within this cosine and this distance in spacings
 OPEN_DISTANCE = 0.5  # spacings from a point to its open place
 AFTER_PAIRS = 1e3  # rank of an open place: above the length of any pair in spacings
@@ -159,7 +159,7 @@ def propose(
 
 def project_to_tangent(direction: Float[Array, "m 3"], normal: Float[Array, "m 3"]) -> Float[Array, "m 3"]:
     """Unit vectors: the directions projected to the planes of the normals; any vector of the plane if that is 0."""
-    axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(3)[:1], jnp.eye(3)[1:2])
+    axis = jnp.where(jnp.abs(normal[:, :1]) < 0.6, jnp.eye(1, 3, dtype=normal.dtype), jnp.eye(1, 3, 1, normal.dtype))
     flat = direction - jnp.sum(direction * normal, axis=1, keepdims=True) * normal
     other = axis - jnp.sum(axis * normal, axis=1, keepdims=True) * normal
     return normalize(jnp.where(jnp.sum(flat**2, axis=1, keepdims=True) > 1e-6, flat, other))

@@ -170,15 +170,18 @@ def test_gradients_in_strict_promotion_and_by_a_camera_of_float64(lights, contex
     near = neighbors(points)
     of_dense = np.tile(near, (1 + CANDIDATES, 1))
 
-    def loss(position, pose):
-        dense = densify(params, points.replace(positions=position), near)
+    def loss(position, color, pose):
+        dense = densify(params, points.replace(positions=position, base_color=color), near)
+        assert dense.positions.dtype == jnp.float32
         seen = view().replace(cam_to_world=pose, intrinsics=lens)
         return jnp.mean(render(params, encode(params, dense, of_dense), seen, lights[0], plan=ROOM).image)
 
+    given = jnp.asarray(points.positions), jnp.asarray(points.base_color)
     with context:
         pose, lens = (jnp.asarray(np.float64(x)) for x in (view().cam_to_world, view().intrinsics))
-        by_position, by_pose = jax.eval_shape(jax.grad(loss, (0, 1)), jnp.asarray(points.positions), pose)
-    assert by_position.dtype == jnp.float32
+        by_position, by_pose = jax.eval_shape(jax.grad(loss, (0, 2)), *given, pose)
+        by_color = jax.eval_shape(jax.grad(lambda color: loss(given[0], color, pose)), given[1])  # pose has no tangent
+    assert by_position.dtype == by_color.dtype == jnp.float32
     assert by_pose.dtype == pose.dtype
 
 
