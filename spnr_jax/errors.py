@@ -144,7 +144,7 @@ def guard(work: Callable[[], object], name: str, debug: bool = False) -> int:
             try:
                 work()
             finally:
-                sys.stdout.flush()
+                _flush(sys.stdout)
     except KeyboardInterrupt as stop:
         print(f"{name}: {str(stop) or 'stopped'}", file=sys.stderr)
         return STOPPED
@@ -170,10 +170,15 @@ def leave(code: int) -> NoReturn:
     """
     signal.signal(signal.SIGINT, lambda number, frame: os._exit(code))
     if code == STOPPED:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        _flush(sys.stdout, sys.stderr)
         os._exit(code)
     sys.exit(code)
+
+
+def _flush(*streams: Any) -> None:
+    for stream in streams:
+        if stream is not None:  # closed before Python began
+            stream.flush()
 
 
 @contextlib.contextmanager

@@ -60,6 +60,8 @@ REFUSED = [  # command, what its line says
     ("evaluate missing RUN", "spnr-data generate"),
     ("evaluate UNTESTED RUN", "the test split is empty; score --split train, or generate the data set anew"),
     ("evaluate DATA .", "not a run folder (config.json is missing); train one with `spnr train DATA"),
+    ("evaluate DATA DATA", "a data set, where a run folder is expected"),
+    ("train DATA DATA", "a data set, where a run folder is expected"),
     ("render empty.ply --run RUN", "empty.ply: the file is empty"),
     ("render point.xyz --run RUN", "holds 1 point in 1 place: no object can be drawn"),
     ("render three.xyz --run RUN --out point.xyz", "point.xyz is a file, not a folder"),

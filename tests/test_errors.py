@@ -150,6 +150,13 @@ def test_a_stop_after_the_work_is_done_ends_python_without_a_word():
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
+def test_output_that_was_closed_before_the_start_is_no_error():
+    program = "from spnr_jax import errors; errors.leave(errors.guard(lambda: print('done'), 'spnr'))"
+    command = f'"{sys.executable}" -c "{program}" >&-'
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_stop_while_a_command_is_imported_is_one_line(tmp_path):
     (tmp_path / "slow.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('imported')")
     program = (

@@ -19,7 +19,7 @@ from spnr_jax.kernels.cameras import is_rotation
 from spnr_jax.kernels.records import Camera
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIRECTANGULAR")
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 PIXELS = {"w", "h", "fl_x", "fl_y", "cx", "cy"}  # entries in pixels
 SIZE = 512  # width and height if a file has none of these
 EXPECTED = "expected the transforms.json of NeRF or nerfstudio: frames with transform_matrix, w, h and fl_x"
@@ -75,8 +75,9 @@ def cameras_of(
 @np.errstate(all="ignore")  # overflow in float32 gives infinity, which is refused
 def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origin: np.ndarray) -> Camera:
     """One camera; in float64 until the origin is subtracted."""
-    if entries.get("camera_model") in FISHEYE:
-        raise UserError(f"camera_model {entries['camera_model']}, where pinhole cameras are drawn")
+    model = "a fisheye" if entries.get("is_fisheye") else str(entries.get("camera_model") or "PINHOLE")
+    if model.upper() not in PINHOLES:
+        raise UserError(f"camera_model {model}, where pinhole cameras are drawn")
     width, height = (int(entries[name]) for name in "wh")
     if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
         raise UserError(f"{width} x {height} pixels in frame {number}, where 1 to {MOST_PIXELS} are drawn")

@@ -5,6 +5,7 @@
                    not occlude each other; from two spacings on, the front entry occludes the one behind
     blend weight   of an entry in its pixel: the weights of a group add up to 1 - exp(-optical depth), times the
                    transmittance before it; over all groups they add up to the opacity
+    color weight   those of a group have the same sum, but narrower kernels divide it
 
 A *slot* is a covered pixel.  Lists are arrays (list, slots): the entries of each slot, front to back.
 """
@@ -24,12 +25,14 @@ from spnr_jax.surfels.splatting import Entries, Footprints
 
 CENTRE_TAU = 3.0  # optical depth at the centre of a disc
 LIST_LENGTH = 24  # largest number of entries of a pixel
+BLOCK = 2048  # slots blended at a time: their lists stay in the cache of a core
 COMPARED = 8  # entries on each side in the list that are compared in depth; those farther in front occlude
 THIN_TAU = 0.03  # optical depth of a group below which its mean transmittance is a series
 LEAST_OPACITY = 1e-4  # least summed blend weight that means are divided by
-SHARP_POWER = 4  # power of the kernel for the narrower weights that colours are blended with
-LEAST_WEIGHT = 1e-12  # summed narrow weights below which there is no colour; float32 holds the square
-FADE = 1e-4  # summed narrow weights below which the distances of the centres fade to 0
+SHARP_POWER = 4  # power of the kernel, times which an optical depth is narrow
+LEAST_WEIGHT = 1e-12  # sum of narrow weights of a pixel below which it has no colour
+LEAST_SUM = 1e-34  # of a group that its entries are divided by: float32 holds the inverse
+FADE = 1e-4  # sum of narrow weights below which the distances of the centres fade to 0
 
 
 def blend(
@@ -46,53 +49,76 @@ def blend(
     The normals of the surfels face the camera (`shader.face_camera`), those of their footprints outward.
     """
     table, pixel_of = _build_lists(entries, slots, camera.height * camera.width)
-    point, depth, coverage, blend_weight, sharp_weight = _weigh_entries(entries, table, jnp.asarray(surfels.spacing))
     normal = jnp.stack(numerics.rotate_columns(camera.cam_to_world[:, :3], surfels.normal), axis=-1)
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
     narrow = jnp.concatenate([_gather_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
+    size = min(BLOCK, slots)
+    blocks = -(-slots // size)
+    packed = jnp.pad(jnp.concatenate([table, pixel_of[None]]), ((0, 0), (0, blocks * size - slots)), constant_values=-1)
+
+    def blend_block(block: Int[Array, "rows block"]) -> GBuffer:
+        return _blend_lists(entries, surfels, block[:-1], block[-1], wide, narrow, camera)
+
+    of_blocks = jax.lax.map(blend_block, jnp.moveaxis(packed.reshape(len(packed), blocks, size), 1, 0))
+    of_slots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:slots], of_blocks)
+    return _place_in_picture(of_slots, pixel_of, camera)
+
+
+def _blend_lists(
+    entries: Entries,
+    surfels: Surfels,
+    table: Int[Array, "list slots"],
+    pixel_of: Int[Array, " slots"],
+    wide: Float[Array, "points features"],
+    narrow: Float[Array, "points 12"],
+    camera: Camera,
+) -> GBuffer:
+    """The G-buffer of slots, from their lists; `wide` and `narrow` are what is averaged with either weights."""
+    point, depth, coverage, blend_weight, color_weight, sharp_weight = _weigh_entries(entries, table, surfels)
     opacity = jnp.sum(blend_weight, axis=0)
     divisor = larger(opacity, LEAST_OPACITY)
     inverse = 1 / divisor
     means = _sum_rows(blend_weight, point, wide) * inverse[:, None]
-    mean_depth = jnp.sum(blend_weight * depth, axis=0) / divisor
+    features = means.shape[1] - 4
+    attributes, normal, log_spacing = jnp.split(means, (features, features + 3), axis=1)
+    mean_depth = depth[0] + jnp.sum(blend_weight * (depth - depth[:1]), axis=0) / divisor  # faint: of the front entry
     squared = jnp.sum(blend_weight * (depth - mean_depth[None]) ** 2, axis=0)  # about the mean: else all digits cancel
-    sharp = jnp.sum(sharp_weight, axis=0)
+    sharp, colored = (jnp.sum(x, axis=0) for x in (sharp_weight, color_weight))
     has_color = sharp > LEAST_WEIGHT
-    known_sharp = jnp.where(has_color, sharp, 1)
-    ahead = jnp.sum(sharp_weight * depth, axis=0) / known_sharp
+    inverse_color = jnp.where(has_color, 1 / jnp.where(has_color, colored, 1), 0)
+    ahead = jnp.sum(color_weight * depth, axis=0) * inverse_color
     pixel = jnp.stack([pixel_of % camera.width, pixel_of // camera.width], axis=-1).astype(depth.dtype) + 0.5
-    color, centre = jnp.split(_sum_colors(sharp_weight, point, narrow, pixel, ahead, camera), (3,), axis=1)
-    features = attributes.shape[1]
-    of_slots = GBuffer(
+    color, centre = _sum_colors(color_weight, sharp_weight, point, narrow, pixel, ahead, camera)
+    return GBuffer(
         opacity=smaller(opacity, 1),
         coverage=coverage,
         depth=mean_depth,
         depth_deviation=safe_sqrt(squared * inverse),
-        log_spacing=means[:, features + 3],
-        normal=means[:, features : features + 3],
-        color=color * jnp.where(has_color, 1 / known_sharp, 0)[:, None],
-        attributes=means[:, :features],
+        log_spacing=log_spacing[:, 0],
+        normal=normal,
+        color=color * inverse_color[:, None],
+        attributes=attributes,
         sharp_weight=sharp,
         centre_offset=(centre - sharp[:, None] * pixel) / (sharp + FADE)[:, None],
     )
-    return _place_in_picture(of_slots, pixel_of, camera)
 
 
 def _weigh_entries(
-    entries: Entries, table: Int[Array, "list slots"], spacing: Float[Array, " points"]
-) -> tuple[Int[Array, "list slots"], Array, Float[Array, " slots"], Array, Array]:
-    """Disc, depth, coverage of each slot, blend weight, and the narrower weight for colours."""
+    entries: Entries, table: Int[Array, "list slots"], surfels: Surfels
+) -> tuple[Int[Array, "list slots"], Array, Float[Array, " slots"], Array, Array, Array]:
+    """Disc, depth, coverage of each slot, blend weight, color weight, and blend weight times the narrower kernel."""
     listed = table >= 0
     table = jnp.maximum(table, 0)
     point = jax.lax.optimization_barrier(entries.point[table])
     kernel, facing = jnp.where(listed, entries.kernel[table], 0), entries.facing[table]
-    weight = kernel**2 * facing
-    weight, depth, spacing = jax.lax.optimization_barrier((weight, entries.depth[table], spacing[point]))
-    blend_weight, transmittance = compute_blend_weights(CENTRE_TAU * weight, depth, spacing)
-    sharp_weight = blend_weight * kernel**SHARP_POWER * facing
-    blend_weight, sharp_weight = jax.lax.optimization_barrier((blend_weight, sharp_weight))
-    return point, depth, jnp.sum(weight * transmittance, axis=0), blend_weight, sharp_weight
+    weight, narrowing = kernel**2 * facing, kernel**SHARP_POWER * facing
+    known = weight, narrowing, entries.depth[table], jnp.asarray(surfels.spacing)[point]
+    weight, narrowing, depth, spacing = jax.lax.optimization_barrier(known)
+    tau = CENTRE_TAU * weight
+    blend_weight, color_weight, transmittance = compute_blend_weights(tau, tau * narrowing, depth, spacing)
+    shares = jax.lax.optimization_barrier((blend_weight, color_weight, blend_weight * narrowing))
+    return point, depth, jnp.sum(weight * transmittance, axis=0), *shares
 
 
 def _place_in_picture(of_slots: GBuffer, pixel_of: Int[Array, " slots"], camera: Camera) -> GBuffer:
@@ -131,13 +157,14 @@ def _gather_colors(surfels: Surfels) -> Float[Array, "points 10"]:
 
 
 def _sum_colors(
+    color_weight: Float[Array, "list slots"],
     sharp_weight: Float[Array, "list slots"],
     point: Int[Array, "list slots"],
     rows: Float[Array, "points 12"],
     pixel: Float[Array, "slots 2"],
     ahead: Float[Array, " slots"],
     camera: Camera,
-) -> Float[Array, "slots 5"]:
+) -> tuple[Float[Array, "slots 3"], Float[Array, "slots 2"]]:
     """Weighted sums of the discs' colours where the ray meets the surface, and of the discs' centres.
 
     Rows: the 10 columns of `_gather_colors`, then column and row of the disc's centre in pixels, as `pixel` has them
@@ -147,13 +174,15 @@ def _sum_colors(
     pose, width = camera.cam_to_world, larger(ahead, 1e-6) / camera.intrinsics[0, 0]
     where = [pose[i, 0] * right + pose[i, 1] * up - pose[i, 2] * ahead + pose[i, 3] for i in range(3)]
 
-    def add(sums: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
-        color, across, border, jump, centre = jnp.split(rows[at[1]], (3, 6, 7, 10), axis=1)
+    def add(sums: Array, at: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        color, across, border, jump, centre = jnp.split(rows[at[2]], (3, 6, 7, 10), axis=1)
         beyond = sum(across[:, i] * where[i] for i in range(3)) - border[:, 0]
         color += clamp(0.5 + beyond / width, 0, 1)[:, None] * jump
-        return sums + at[0][:, None] * jnp.concatenate([color, centre], axis=1), None
+        return sums + jnp.concatenate([at[0][:, None] * color, at[1][:, None] * centre], axis=1), None
 
-    return jax.lax.scan(add, jnp.zeros((point.shape[1], 5), rows.dtype), (sharp_weight, point), unroll=8)[0]
+    empty, places = jnp.zeros((point.shape[1], 5), rows.dtype), (color_weight, sharp_weight, point)
+    color, centre = jnp.split(jax.lax.scan(add, empty, places, unroll=8)[0], (3,), axis=1)
+    return color, centre
 
 
 def _build_lists(entries: Entries, slots: int, pixels: int) -> tuple[Int[Array, "list slots"], Int[Array, " slots"]]:
@@ -167,65 +196,82 @@ def _build_lists(entries: Entries, slots: int, pixels: int) -> tuple[Int[Array, 
 
 
 def _blend_weights(
-    tau: Float[Array, "list slots"], depth: Float[Array, "list slots"], spacing: Float[Array, "list slots"]
-) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"]]:
-    """Blend weight of each entry, and the transmittance in front of it, for lists sorted by depth.
+    tau: Float[Array, "list slots"],
+    narrow: Float[Array, "list slots"],
+    depth: Float[Array, "list slots"],
+    spacing: Float[Array, "list slots"],
+) -> tuple[Float[Array, "list slots"], Float[Array, "list slots"], Float[Array, "list slots"]]:
+    """Blend weight, color weight and transmittance in front of each entry, for lists sorted by depth.
 
-    A group of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths.
+    A group of optical depth t has the opacity 1 - exp(-t), divided among its entries by their optical depths (blend
+    weights), and by their narrow ones (color weights).
     """
-    tau_before, tau_group = _optical_depths(tau, depth, spacing)
+    tau_before, tau_group, narrow_group = _sum_groups(tau, narrow, depth, spacing)
     transmittance = jnp.exp(-tau_before)
-    return tau * transmittance * _mean_transmittance(tau_group)[0], transmittance
+    # by roots, because XLA would compute the sums anew at each use of a quotient
+    per_tau, per_narrow = (jax.lax.rsqrt(larger(x, LEAST_SUM)) ** 2 for x in (tau_group, narrow_group))
+    visible = transmittance * one_minus_exp(1 / per_tau)
+    return tau * per_tau * visible, narrow * per_narrow * visible, transmittance
 
 
 def _pull_back_blend_weights(
-    primals: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
-    """Gradients by tau, depth and spacing; `by_x` is the gradient by x.
+    primals: tuple[Array, Array, Array, Array], cotangents: tuple[Array, Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Gradients by tau, narrow, depth and spacing; `by_x` is the gradient by x.
 
     With o_ij = 1 for entries of one group, falling to 0 for separate ones, and m(t) = (1 - exp(-t)) / t, the weights
     are
 
-        T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(tau_i + sum_j o_ij tau_j).
+        T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(t_i),    c_i = t_i T_i m(t_i) n_i / N_i
 
-    Each pair of entries contributes to both of its members.  The gradient that JAX derives takes twenty times as long
-    as the weights.
+    with the sums t_i = tau_i + sum_j o_ij tau_j and N_i = n_i + sum_j o_ij n_j of a group.  Each pair of entries
+    contributes to both of its members.  The gradient that JAX derives takes twenty times as long as the weights.
     """
-    tau, depth, spacing = primals
-    by_weight, by_transmittance = cotangents
-    tau_before, tau_group = _optical_depths(*primals)
+    tau, narrow, depth, spacing = primals
+    by_weight, by_color, by_transmittance = cotangents
+    tau_before, tau_group, narrow_group = _sum_groups(*primals)
     transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_group)
-    by_group = by_weight * (tau * transmittance * slope)
-    by_before = -transmittance * (by_transmittance + by_weight * (tau * mean))
+    inverse = 1 / larger(narrow_group, LEAST_SUM)
+    share, by_share = narrow * inverse, by_color * (transmittance * tau_group * mean)
+    by_group = transmittance * (by_weight * (tau * slope) + by_color * (share * (mean + tau_group * slope)))
+    by_before = -transmittance * (by_transmittance + by_weight * (tau * mean)) - by_share * share
+    by_sum = by_share * jnp.where(narrow_group > LEAST_SUM, -share * inverse, 0)
+    by_narrow = by_share * inverse + by_sum
     by_tau = by_weight * (transmittance * mean) + by_group
     by_tau += jnp.matmul(_far_in_front(tau).T, by_before, precision="highest")
     by_depth = by_spacing = jnp.zeros_like(tau)
-    by_group, by_before = map(jax.lax.optimization_barrier, (by_group, by_before))  # one would be linear in all
-    known = tau, depth, spacing, by_group, by_before
-    for step, (other_tau, *places, other_by_group, other_by_before) in _shift_lists(known, (0.0, 0.0, 1.0, 0.0, 0.0)):
+    slopes = by_group, by_before, by_sum
+    by_group, by_before, by_sum = map(jax.lax.optimization_barrier, slopes)  # one would be linear in all
+    for step, (other_tau, other_narrow, *places, other_by_group, other_by_before, other_by_sum) in _shift_lists(
+        (*primals, by_group, by_before, by_sum), (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    ):
         gap, middle = _measure_gap(step, depth, spacing, *places)
         x = clamp(gap - 1, 0, 1)
         apart, slope = x * x * (3 - 2 * x), 6 * x * (1 - x)
         by_tau += other_by_group * (1 - apart) + (other_by_before * apart if step > 0 else 0)
+        by_narrow += other_by_sum * (1 - apart)
         through = tau * other_by_before if step > 0 else other_tau * by_before  # the front entry occludes the other
-        by_gap = slope * (through - other_tau * by_group - tau * other_by_group)
+        within = other_tau * by_group + tau * other_by_group + other_narrow * by_sum + narrow * other_by_sum
+        by_gap = slope * (through - within)
         by_depth += by_gap / middle if step < 0 else -by_gap / middle
         by_spacing -= 0.5 * by_gap * gap / middle
-    return by_tau, by_depth, by_spacing
+    return by_tau, by_narrow, by_depth, by_spacing
 
 
 compute_blend_weights = jax.checkpoint(numerics.with_gradient(_blend_weights, _pull_back_blend_weights))
 
 
-def _optical_depths(tau: Array, depth: Array, spacing: Array) -> tuple[Array, Array]:
-    """Optical depth in front of each entry's group, and that of the group."""
+def _sum_groups(tau: Array, narrow: Array, depth: Array, spacing: Array) -> tuple[Array, Array, Array]:
+    """Optical depth in front of each entry's group, that of the group, and the sum of its narrow ones."""
     tau_before, tau_group = jnp.matmul(_far_in_front(tau), tau, precision="highest"), tau
-    for step, (other_tau, *places) in _shift_lists((tau, depth, spacing), (0.0, 0.0, 1.0)):
+    narrow_group = narrow
+    for step, (other_tau, other_narrow, *places) in _shift_lists((tau, narrow, depth, spacing), (0.0, 0.0, 0.0, 1.0)):
         apart = smoothstep(_measure_gap(step, depth, spacing, *places)[0] - 1)
         tau_group += other_tau * (1 - apart)
+        narrow_group += other_narrow * (1 - apart)
         if step < 0:
             tau_before += other_tau * apart
-    return tau_before, tau_group
+    return tau_before, tau_group, narrow_group
 
 
 def _far_in_front(lists: Array) -> Array:

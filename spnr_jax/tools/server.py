@@ -169,7 +169,7 @@ class Browser:
     ) -> None:
         self._client, self._model, self._reading, self._network = client, model, reading, network
         self._light: dict[str, Any] = {}
-        self._newest: viser.UploadedFile | None = None  # the file that was opened last stays
+        self._opened, self._newest = 0, 0  # files opened, and the number of the one that is shown
         self.loop = Loop(first, lambda state, moving: self._try(lambda: self._draw(state, moving)))
         gui = client.gui
         self._title = gui.add_markdown(TITLE.format(first.name, len(first.cloud.positions)))
@@ -296,7 +296,8 @@ class Browser:
             light = frame.read_upload(file.name, file.content, images.read_light)
             self.loop.submit(lambda state: self._show_choice(frame.add_map(state, name, light)))
             return
-        self._newest = file
+        self._opened += 1
+        number = self._opened
         read = partial(clouds.read_cloud, **self._reading, report=notes.append)
         opening = self._client.add_notification("Opening", name, loading=True, with_close_button=False)
         try:
@@ -304,7 +305,8 @@ class Browser:
             volume = self._model.encode(cloud)
         finally:
             opening.remove()
-        if file is self._newest:
+        if number > self._newest:  # the file that was opened last stays
+            self._newest = number
             self._replace(name=name, cloud=cloud, volume=volume)
             self._title.content = "; ".join([TITLE.format(name, len(cloud.positions)), *notes])
 

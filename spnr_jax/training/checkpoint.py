@@ -81,11 +81,18 @@ def read_light(run: Path) -> str | None:
     return lines[1] if len(lines) > 1 else None
 
 
+def check_no_data(run: Path) -> None:
+    """UserError for the folder of a data set."""
+    if (run / "dataset.json").is_file():
+        raise UserError(f"{run}: a data set, where a run folder is expected")
+
+
 def read_config(run: Path | str) -> TrainConfig:
     """The config of a run folder; ValueError if there is none or it is not of this version."""
     path = Path(run) / "config.json"
     if Path(run).is_file():
         raise UserError(f"{run}: a file; expected a run folder, a file of weights (.npz) or the name surfels")
+    check_no_data(Path(run))
     if not path.is_file():
         raise UserError(f"{run}: not a run folder (config.json is missing); train one with `spnr train DATA {run}`")
     try:

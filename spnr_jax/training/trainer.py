@@ -60,6 +60,7 @@ def train(
     data set's pictures, if it is not the room.
     """
     runtime.limit_arenas()
+    checkpoint.check_no_data(run)
     programs.check_divides(mesh, config.batch_objects)
     # before the run folder is made: data that do not suit leave nothing
     batches_from = method_of(config.model).prepare(config, dataset, run, light=light)

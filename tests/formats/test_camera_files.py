@@ -60,6 +60,8 @@ def test_an_angle_of_view_gives_the_focal_length_distortion_is_said_and_cameras_
         (lambda d: d.update(fl_x=None), "where a number should be"),
         (lambda d: d.update(fl_y=-1), "expected positive ones"),
         (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "where pinhole cameras are drawn"),
+        (lambda d: d.update(camera_model="FISHEYE624"), "FISHEYE624, where pinhole cameras are drawn"),
+        (lambda d: d.update(is_fisheye=True), "a fisheye, where pinhole cameras are drawn"),
         (lambda d: d["frames"][1]["transform_matrix"].pop(), None),  # three rows suffice
         (lambda d: d["frames"][1]["transform_matrix"].clear(), "no 4 x 4 matrix (frame 1)"),
         (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "NaN or infinity"),

@@ -203,13 +203,14 @@ NEIGHBORHOODS = (
 
 
 def lists(rng, tau=1.0, distance=2.0):
-    """Optical depths up to that, depths from that distance on, spacings."""
+    """Optical depths up to that, narrow ones, depths from that distance on, spacings."""
     depth = np.sort(distance + rng.uniform(0, 3, (24, POINTS)), axis=0)
-    return tau * rng.uniform(0.1, 1, depth.shape), depth, rng.uniform(0.2, 0.6, depth.shape)
+    tau, narrowing = tau * rng.uniform(0.1, 1, depth.shape), rng.uniform(0.1, 1, depth.shape)
+    return tau, tau * narrowing, depth, rng.uniform(0.2, 0.6, depth.shape)
 
 
-def shares_twin(tau, depth, spacing):
-    return reference.shares(tau, depth, spacing, blending.COMPARED)
+def shares_twin(*lists):
+    return reference.shares(*lists, blending.COMPARED)
 
 
 @st.composite
@@ -218,19 +219,20 @@ def any_lists(draw):
     tau, seed = draw(extremes(24, 6, signed=False, high=3)), draw(st.integers(0, 99))
     high, size, rng = draw(st.integers(-6, 3)), draw(st.integers(-3, 1)), np.random.default_rng(seed)
     depth = np.sort(1 + 10.0**high * rng.uniform(size=tau.shape), axis=0)
-    return tau, np.float32(depth), np.float32(10.0**size * rng.uniform(0.5, 1, tau.shape))
+    narrow = np.float32(tau * rng.uniform(size=tau.shape))
+    return tau, narrow, np.float32(depth), np.float32(10.0**size * rng.uniform(0.5, 1, tau.shape))
 
 
-def gap_rounding(tau, depth, spacing):
+def gap_rounding(tau, narrow, depth, spacing):
     """What float32 knows of a gap in spacings."""
     return np.abs(depth).max() / spacing.min()
 
 
 def within_one(arguments, outputs):
-    """Shares lie in 0 to 1, and so does their sum."""
-    share, left = outputs
-    assert share.min() >= 0
-    assert left.max() <= 1
+    """Shares lie in 0 to 1, and so does the sum of those that are blend weights."""
+    share, colored, left = outputs
+    assert min(share.min(), colored.min()) >= 0
+    assert max(colored.max(), left.max()) <= 1 + 1e-5
     assert share.sum(axis=0).max() <= 1 + 1e-5
 
 
@@ -238,12 +240,12 @@ def within_one(arguments, outputs):
 LISTS = (
     # thin lists are a series, to 7e-9: no twin for all
     Law("blend weights", blending.compute_blend_weights, None,
-        (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 1.0)),
+        (Axis("optical depth of an entry", 1e-30, 1, 1e15, lists),), shared=0, floors=(0.0, 0.0, 1.0)),
     Law("blend weights of a thin list", blending.compute_blend_weights, shares_twin,
-        (Axis("optical depth of an entry", 1e-4, 5e-3, 1e-2, lists),), floors=(0.0, 1.0), agreement=1e-7),
+        (Axis("optical depth of an entry", 1e-4, 5e-3, 1e-2, lists),), floors=(0.0, 0.0, 1.0), agreement=1e-7),
     Law("blend weights beside the loop", blending.compute_blend_weights, shares_twin,
-        (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 1.0),
-        extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,
+        (Axis("distance in spacings", 1, 2, 1e4, lambda rng, v: lists(rng, distance=v)),), floors=(0.0, 0.0, 1.0),
+        extremes=Extremes((any_lists(),), floors=lambda *x: (1.0, 1.0, gap_rounding(*x), gap_rounding(*x)), rtol=1e-4,
         atol=lambda tau, *x: 1e-6 * (1 + gap_rounding(tau, *x) * tau.max()), check=within_one)),
 )
 # fmt: on

@@ -133,20 +133,22 @@ def batch_norm(x):
     return (x - mean) / np.sqrt(variance + 1e-5), mean, variance
 
 
-def shares(tau, depth, spacing, near):
-    """Twin of blending.compute_blend_weights: blend weights of lists (entries, slots), and transmittances.
+def shares(tau, narrow, depth, spacing, near):
+    """Twin of blending.compute_blend_weights: blend and color weights of lists (entries, slots), transmittances.
 
     Entries less than a spacing apart in depth blend; those more than `near` places before another hide it.
     """
-    tau, depth, spacing = map(np.float64, (tau, depth, spacing))
-    share, left = np.zeros_like(tau), np.zeros_like(tau)
+    tau, narrow, depth, spacing = map(np.float64, (tau, narrow, depth, spacing))
+    share, colored, left = (np.zeros_like(tau) for _ in range(3))
     for i in range(len(tau)):
-        band, hidden = tau[i].copy(), np.zeros_like(tau[i])
+        band, narrow_band, hidden = tau[i].copy(), narrow[i].copy(), np.zeros_like(tau[i])
         for j in range(len(tau)):
             x = np.clip(np.abs(depth[i] - depth[j]) / (0.5 * (spacing[i] + spacing[j])) - 1, 0, 1)
             apart = x * x * (3 - 2 * x) if abs(i - j) <= near else 1.0
             band += tau[j] * (1 - apart) if i != j else 0
+            narrow_band += narrow[j] * (1 - apart) if i != j else 0
             hidden += tau[j] * apart if j < i else 0
         left[i] = np.exp(-hidden)
         share[i] = tau[i] * left[i] * np.where(band > 0, -np.expm1(-band) / np.where(band > 0, band, 1), 1)
-    return share, left
+        colored[i] = narrow[i] / np.maximum(narrow_band, 1e-34) * left[i] * -np.expm1(-band)
+    return share, colored, left

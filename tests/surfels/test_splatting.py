@@ -50,20 +50,22 @@ def layer(count=500, height=0.0, normal=(0.0, 0.0, 1.0), **columns):
 
 
 def blend_twin(entries, found, view, pixel):
-    """Opacity, coverage, depth, spread, log spacing, normal and attributes of one pixel, in float64."""
+    """Opacity, coverage, depth, spread, log spacing, normal, attributes and color of a pixel, in float64."""
     order = np.asarray(entries.order)[np.asarray(entries.pixel) == pixel][: blending.LIST_LENGTH]
     point = np.asarray(entries.point)[order]
     kernel, facing, depth = (np.float64(x)[order] for x in (entries.kernel, entries.facing, entries.depth))
     spacing, weight = np.float64(found.spacing)[point], kernel**2 * facing
-    lists = (x[:, None] for x in (blending.CENTRE_TAU * weight, depth, spacing))
-    share, left = (x[:, 0] for x in reference.shares(*lists, blending.COMPARED))
+    tau = blending.CENTRE_TAU * weight
+    lists = (x[:, None] for x in (tau, tau * kernel**blending.SHARP_POWER * facing, depth, spacing))
+    share, colored, left = (x[:, 0] for x in reference.shares(*lists, blending.COMPARED))
     opacity = share.sum()
     divisor = max(opacity, blending.LEAST_OPACITY)
-    mean = share @ depth / divisor
+    mean = depth[0] + share @ (depth - depth[0]) / divisor
     spread = np.sqrt(share @ (depth - mean) ** 2 / divisor)
     normal = np.float64(found.normal)[point] @ np.float64(view.cam_to_world)[:, :3]
-    wide = (share @ x / divisor for x in (np.log(spacing), normal, np.float64(found.base_color)[point]))
-    return min(opacity, 1), weight @ left, mean, spread, *wide
+    color = np.float64(found.base_color)[point]
+    wide = (share @ x / divisor for x in (np.log(spacing), normal, color))
+    return min(opacity, 1), weight @ left, mean, spread, *wide, colored @ color / colored.sum()
 
 
 class TestEntries:
@@ -145,11 +147,29 @@ class TestBlend:
         entries, lost = make_entries(found, view, capacity=TOTAL)
         assume(int(lost) == 0 and int(blending.count_covered_pixels(entries)) > 0)
         buffer = blend(entries, found, found.base_color, view, slots=24**2)
-        names = ("opacity", "coverage", "depth", "depth_deviation", "log_spacing", "normal", "attributes")
+        names = ("opacity", "coverage", "depth", "depth_deviation", "log_spacing", "normal", "attributes", "color")
         entries, buffer = jax.tree.map(np.asarray, (entries, buffer))
         for pixel in rng.choice(entries.pixel[entries.pixel < 24**2], 3):
             ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
             close(ours, blend_twin(entries, found, view, pixel), rtol=1e-4, atol=1e-4)
+
+    def test_the_depth_of_a_pixel_that_discs_hardly_cover_is_that_of_its_discs(self):
+        position = np.where(np.arange(500)[:, None] < 1, [0.1, -0.2, 0.0], [0.0, 0.0, 9.0])
+        buffer, _ = draw(surfels(position, (0, 0, 1.0), 0.2), camera(128))
+        covered = buffer.opacity > 0
+        assert (buffer.opacity[covered] < blending.LEAST_OPACITY).any()
+        close(buffer.depth[covered], np.full(covered.sum(), 2.5), rtol=1e-4)
+
+    def test_a_bright_layer_behind_shows_by_its_share_of_the_opacity_where_the_front_discs_end(self):
+        there = np.random.default_rng(0).random(250) < 0.6
+        position = np.concatenate([layer(250, 0.5).position[there], layer(250).position])
+        color = np.repeat(np.where(position[:, 2:] > 0.1, 0.0, 1.0), 3, axis=1)
+        found = surfels(position, (0, 0, 1.0), 2.2 / np.sqrt(250), base_color=color)
+        buffer, _ = draw(found, camera())
+        shown = draw(found.replace(mask=position[:, 2] > 0.1), camera())[0].opacity
+        inner = (shown > 0.05) & (buffer.opacity > 0.2)
+        share = (buffer.opacity - shown)[inner] / buffer.opacity[inner]
+        close(buffer.color[inner].mean(axis=-1), share, atol=0.01)
 
     def test_a_border_of_two_colours_is_a_line_a_pixel_wide_on_a_plane(self):
         across, at, jump = np.array([0.6, 0.8, 0.0]), 0.15, np.array([0.3, -0.2, 0.1])

@@ -72,10 +72,13 @@ def test_the_page_says_why_a_picture_takes_long_until_it_is_drawn_or_fails(monke
     assert page._status.content == ""
 
 
-def test_of_two_files_the_one_that_was_opened_last_stays_though_the_first_takes_longer(monkeypatch):
+@pytest.mark.parametrize("broken", [False, True])
+def test_of_two_files_the_last_that_can_be_read_stays_though_the_first_takes_longer(monkeypatch, broken):
     begun, shown = threading.Event(), []
 
     def read(name, *_):
+        if name == "small.ply" and broken:
+            raise server.UserError(name)
         if name == "large.ply":
             begun.set()
             time.sleep(0.3)
@@ -83,15 +86,16 @@ def test_of_two_files_the_one_that_was_opened_last_stays_though_the_first_takes_
 
     monkeypatch.setattr(server.frame, "read_upload", read)
     client = MagicMock()
-    page = SimpleNamespace(_model=SimpleNamespace(encode=id), _reading={}, _client=client)
+    page = SimpleNamespace(_model=SimpleNamespace(encode=id), _reading={}, _client=client, _opened=0, _newest=0)
     page._replace, page._title = lambda name, **_: shown.append(name), SimpleNamespace()
     files = [server.viser.UploadedFile(name, b"") for name in ("large.ply", "small.ply")]
     first = threading.Thread(target=server.Browser._open, args=(page, files[0]))
     first.start()
     assert begun.wait(10)
-    server.Browser._open(page, files[1])
+    with pytest.raises(server.UserError) if broken else contextlib.nullcontext():
+        server.Browser._open(page, files[1])
     first.join(10)
-    assert shown == ["small.ply"]
-    assert page._title.content.startswith("small.ply")
+    assert shown == ["large.ply" if broken else "small.ply"]
+    assert page._title.content.startswith(shown[0])
     assert [call.args for call in client.add_notification.call_args_list] == [("Opening", x.name) for x in files]
     assert client.add_notification.return_value.remove.call_count == 2
