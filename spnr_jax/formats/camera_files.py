@@ -75,9 +75,10 @@ def cameras_of(
 @np.errstate(all="ignore")  # overflow in float32 gives infinity, which is refused
 def _camera(entries: Mapping[str, Any], number: int, rotation: np.ndarray, origin: np.ndarray) -> Camera:
     """One camera; in float64 until the origin is subtracted."""
-    model = "a fisheye" if entries.get("is_fisheye") else str(entries.get("camera_model") or "PINHOLE")
-    if model.upper() not in PINHOLES:
-        raise UserError(f"camera_model {model}, where pinhole cameras are drawn")
+    model, fisheye = str(entries.get("camera_model") or "PINHOLE"), entries.get("is_fisheye")
+    if fisheye or model.upper() not in PINHOLES:
+        found = "a fisheye" if fisheye else f"camera_model {model}"
+        raise UserError(f"{found}, where pinhole cameras are drawn")
     width, height = (int(entries[name]) for name in "wh")
     if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
         raise UserError(f"{width} x {height} pixels in frame {number}, where 1 to {MOST_PIXELS} are drawn")

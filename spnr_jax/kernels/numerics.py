@@ -147,6 +147,13 @@ def with_gradient(function: Callable, pull_back: Callable) -> Callable:
     return differentiable
 
 
+def split_blocks(values: Shaped[Array, "rows n"], size: int, fill: int) -> Shaped[Array, "blocks rows {size}"]:
+    """The columns in blocks of this size, the last one padded with `fill`."""
+    blocks = -(-values.shape[1] // size)
+    values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
+    return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
+
+
 def smoothstep(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """0 below 0, 1 above 1, and a smooth cubic in between."""
     x = clamp(x, 0, 1)

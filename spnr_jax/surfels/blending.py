@@ -27,7 +27,7 @@ CENTRE_TAU = 3.0  # optical depth at the centre of a disc
 LIST_LENGTH = 24  # largest number of entries of a pixel
 BLOCK = 2048  # slots blended at a time: their lists stay in the cache of a core
 COMPARED = 8  # entries on each side in the list that are compared in depth; those farther in front occlude
-THIN_TAU = 0.03  # optical depth of a group below which its mean transmittance is a series
+THIN_TAU = 0.03  # optical depth of a group below which the slope of its mean transmittance is a series
 LEAST_OPACITY = 1e-4  # least summed blend weight that means are divided by
 SHARP_POWER = 4  # power of the kernel, times which an optical depth is narrow
 LEAST_WEIGHT = 1e-12  # sum of narrow weights of a pixel below which it has no colour
@@ -53,14 +53,12 @@ def blend(
     wide = jnp.concatenate([attributes, normal, jnp.log(surfels.spacing)[:, None]], axis=1)
     narrow = jnp.concatenate([_gather_colors(surfels), jnp.stack([foot.column, foot.row], axis=-1)], axis=1)
     wide, narrow = jax.lax.optimization_barrier((wide, narrow))
-    size = min(BLOCK, slots)
-    blocks = -(-slots // size)
-    packed = jnp.pad(jnp.concatenate([table, pixel_of[None]]), ((0, 0), (0, blocks * size - slots)), constant_values=-1)
 
     def blend_block(block: Int[Array, "rows block"]) -> GBuffer:
         return _blend_lists(entries, surfels, block[:-1], block[-1], wide, narrow, camera)
 
-    of_blocks = jax.lax.map(blend_block, jnp.moveaxis(packed.reshape(len(packed), blocks, size), 1, 0))
+    blocks = numerics.split_blocks(jnp.concatenate([table, pixel_of[None]]), min(BLOCK, slots), -1)
+    of_blocks = jax.lax.map(blend_block, blocks)
     of_slots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:slots], of_blocks)
     return _place_in_picture(of_slots, pixel_of, camera)
 
@@ -222,7 +220,7 @@ def _pull_back_blend_weights(
     With o_ij = 1 for entries of one group, falling to 0 for separate ones, and m(t) = (1 - exp(-t)) / t, the weights
     are
 
-        T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(t_i),    c_i = t_i T_i m(t_i) n_i / N_i
+        T_i = exp(-sum_{j in front} (1 - o_ij) tau_j),    a_i = tau_i T_i m(t_i),    c_i = n_i T_i (1 - exp(-t_i)) / N_i
 
     with the sums t_i = tau_i + sum_j o_ij tau_j and N_i = n_i + sum_j o_ij n_j of a group.  Each pair of entries
     contributes to both of its members.  The gradient that JAX derives takes twenty times as long as the weights.
@@ -232,8 +230,8 @@ def _pull_back_blend_weights(
     tau_before, tau_group, narrow_group = _sum_groups(*primals)
     transmittance, (mean, slope) = jnp.exp(-tau_before), _mean_transmittance(tau_group)
     inverse = 1 / larger(narrow_group, LEAST_SUM)
-    share, by_share = narrow * inverse, by_color * (transmittance * tau_group * mean)
-    by_group = transmittance * (by_weight * (tau * slope) + by_color * (share * (mean + tau_group * slope)))
+    share, by_share = narrow * inverse, by_color * (transmittance * one_minus_exp(tau_group))
+    by_group = transmittance * (by_weight * (tau * slope) + by_color * (share * jnp.exp(-tau_group)))
     by_before = -transmittance * (by_transmittance + by_weight * (tau * mean)) - by_share * share
     by_sum = by_share * jnp.where(narrow_group > LEAST_SUM, -share * inverse, 0)
     by_narrow = by_share * inverse + by_sum
@@ -300,9 +298,10 @@ def _measure_gap(
 
 
 def _mean_transmittance(tau: Array) -> tuple[Array, Array]:
-    """(1 - exp(-tau)) / tau of a group, and its derivative; a series for small tau, where all digits would cancel."""
-    thin = tau < THIN_TAU
-    thick = jnp.where(thin, 1, tau)
-    mean = jnp.where(thin, 1 - tau * (1 / 2 - tau * (1 / 6 - tau / 24)), one_minus_exp(thick) / thick)
-    slope = jnp.where(thin, -1 / 2 + tau * (1 / 3 - tau * (1 / 8 - tau / 30)), (jnp.exp(-thick) - mean) / thick)
+    """(1 - exp(-tau)) / tau of a group, and its derivative: a series for small tau, where all digits would cancel."""
+    thick = larger(tau, LEAST_SUM)
+    mean = one_minus_exp(thick) / thick
+    slope = jnp.where(
+        tau < THIN_TAU, -1 / 2 + tau * (1 / 3 - tau * (1 / 8 - tau / 30)), (jnp.exp(-thick) - mean) / thick
+    )
     return mean, slope

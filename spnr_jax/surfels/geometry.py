@@ -30,6 +30,7 @@ from spnr_jax.kernels.numerics import (
     measure_shape,
     normalize,
     safe_sqrt,
+    split_blocks,
     tangent_frame,
 )
 from spnr_jax.kernels.records import AnyArray, PointCloud, Surfels
@@ -140,15 +141,8 @@ def map_blocks(
     if size == count:
         return _unpack(jax.checkpoint(compute)(neighbors, packed), forms[-1])
 
-    found = jax.lax.map(jax.checkpoint(one), (_split(neighbors, size, -1), _split(packed, size, 0)))
+    found = jax.lax.map(jax.checkpoint(one), (split_blocks(neighbors, size, -1), split_blocks(packed, size, 0)))
     return _unpack(jnp.moveaxis(found, 0, 1).reshape(found.shape[1], -1)[:, :count], forms[-1])
-
-
-def _split(values: Array, size: int, fill: int) -> Array:
-    """Columns of all points, padded and split into blocks of this size."""
-    blocks = -(-values.shape[1] // size)
-    values = jnp.pad(values, [(0, 0), (0, blocks * size - values.shape[1])], constant_values=fill)
-    return jnp.moveaxis(values.reshape(len(values), blocks, size), 1, 0)
 
 
 def _pack(tree: Any) -> Float[Array, "columns points"]:
@@ -311,7 +305,7 @@ def average_visibility(
         return discs.average_rows(*block, rows)
 
     count = CONSTANTS.averaged_neighbors
-    near = _split(points.neighbors[:count], size, -1), _split(weight[:count], size, 1)
+    near = split_blocks(points.neighbors[:count], size, -1), split_blocks(weight[:count], size, 1)
     return jax.lax.map(one, near).reshape(-1, len(visibility))[: len(points.mask)].T
 
 

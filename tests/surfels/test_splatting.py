@@ -153,6 +153,11 @@ class TestBlend:
             ours = [getattr(buffer, name).reshape(24**2, -1)[pixel].squeeze() for name in names]
             close(ours, blend_twin(entries, found, view, pixel), rtol=1e-4, atol=1e-4)
 
+    def test_mean_transmittance_and_slope_are_those_of_float64(self):
+        tau = np.logspace(-3, 1.5, 40)
+        ours = blending._mean_transmittance(jnp.asarray(tau, jnp.float32))
+        close(ours, (-np.expm1(-tau) / tau, (np.exp(-tau) * (1 + tau) - 1) / tau**2), rtol=1e-4)
+
     def test_the_depth_of_a_pixel_that_discs_hardly_cover_is_that_of_its_discs(self):
         position = np.where(np.arange(500)[:, None] < 1, [0.1, -0.2, 0.0], [0.0, 0.0, 9.0])
         buffer, _ = draw(surfels(position, (0, 0, 1.0), 0.2), camera(128))
